@@ -36,9 +36,9 @@ class Signature:
     """Name, arguments and results of a numeric function; every array is dense float64.
 
     Attributes:
-        name: of the function.
-        input_names, output_names: in call order.
-        input_shapes, output_shapes: NumPy shapes of one evaluation.
+        name: name of the function.
+        input_names, output_names: names of the inputs and outputs, in call order.
+        input_shapes, output_shapes: NumPy shape of each input and output in one evaluation.
     """
 
     name: str
@@ -62,11 +62,11 @@ class Signature:
 
     @classmethod
     def from_json(cls, stored: Mapping[str, Any]) -> Signature:
-        """Read what `to_json` wrote."""
+        """Build the signature from the dictionary that `to_json` returned."""
         return cls(**{name: _as_tuple(value) for name, value in stored.items()})
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain lists and strings."""
+        """Return the signature as a dictionary of strings and lists, ready for JSON."""
         found: dict[str, Any] = json.loads(json.dumps(asdict(self)))
         return found
 
@@ -96,9 +96,10 @@ class NumericFunction(ABC):
     """A function from dense float64 arrays to dense float64 arrays.
 
     Attributes:
-        signature: names and shapes.
-        name, input_names, output_names, input_shapes, output_shapes: those of the signature,
-            without the inputs that are bound.
+        signature: names and shapes of all inputs and outputs.
+        name: name of the function.
+        input_names, input_shapes: names and shapes of the inputs that have no bound value.
+        output_names, output_shapes: names and shapes of the outputs.
     """
 
     def __init__(self, signature: Signature) -> None:
@@ -112,10 +113,12 @@ class NumericFunction(ABC):
         self._bound: list[Array] = []
 
     def bound(self, values: Mapping[str, Array]) -> Self:
-        """Return the function with values bound to its last inputs, as far as `values` has them.
+        """Return a copy of the function with fixed values for its last inputs.
+
+        The last input is bound first, and binding stops at the first name missing in `values`.
 
         Args:
-            values: by the names of inputs, each of its input's shape.
+            values: array for each input name, with the shape of that input.
 
         Raises:
             CodegenError: a value does not fit.

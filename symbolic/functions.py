@@ -71,13 +71,14 @@ FRICTION_TOLERANCE = 1e-9
 def candidate_function(model: CellModel) -> ca.Function:
     """Build the evaluator of one candidate: x (n_var,) to every per-sample quantity.
 
-    Outputs (NumPy shapes, n samples): time (n,) [s]; pose (n, 6), rate, second_rate (n, 6) with
-    respect to time; those of `LOAD_OUTPUTS` without the wrenches; per robot i = 1, 2 those of
-    `TRACK_OUTPUTS` as q_i (n, joints) and so on; constraint (n, 9), see `CONSTRAINTS`; violation
-    (9,): largest positive value of each constraint over the samples; violation_time (9,): time
-    for which each is violated, over the duration.
+    Outputs (NumPy shapes, n samples): time (n,) [s]; pose (n, 6) of the box [m, rad]; rate and
+    second_rate (n, 6), the time derivatives of the pose; every output in `LOAD_OUTPUTS` except the
+    wrenches; for robot i = 1, 2 every output in `TRACK_OUTPUTS` with the suffix _i, such as q_i
+    (n, joints) [rad]; constraint (n, 9) with the columns `CONSTRAINTS`; violation (9,), the largest
+    positive value of each constraint over the samples; violation_time (9,), the share of the
+    duration during which each constraint is violated.
 
-    In drivable cells the inputs of `DRIVE_INPUTS` follow x.
+    In drivable cells the inputs named in `DRIVE_INPUTS` follow x. The cell's parameters come last.
     """
     workcell = model.workcell
     n = workcell.task.samples
@@ -133,11 +134,11 @@ def _constraints(
 
 
 def motion_function(model: CellModel) -> ca.Function:
-    """Build the evaluator without forces, much cheaper where a solver finds those; not for
-    drivable cells.
+    """Build the evaluator of one candidate's motion, without forces; not for drivable cells.
 
-    Outputs as of `candidate_function`: time, pose, q_1, q_2, and the violation (9,) of reach,
-    joint limits and singularity; friction and pressure count as satisfied.
+    Inputs: x (n_var,), then the cell's parameters. Outputs, with the shapes and units that
+    `candidate_function` gives: time, pose, q_1, q_2, and violation (9,). The violations of
+    friction and pressure are 0.
     """
     workcell = model.workcell
     n = workcell.task.samples
@@ -184,8 +185,10 @@ SAMPLE_NAMES = frozenset(
 
 
 def sample_sizes(workcell: Workcell) -> dict[str, int]:
-    """Return the outputs after the states of `sample_functions`' `sample`, with their number of
-    entries; the candidate's function has the same outputs."""
+    """Return the number of entries of each output of one sample, by the output's name.
+
+    These outputs follow the two states in the function `sample` of `sample_functions`.
+    """
     sizes = dict(_LOAD_SIZES)
     for i, robot in enumerate(workcell.robots, start=1):
         joints = robot.position_lower.shape[0]
@@ -195,13 +198,18 @@ def sample_sizes(workcell: Workcell) -> dict[str, int]:
 
 
 def forces_come_last(workcell: Workcell) -> bool:
-    """Return True if a candidate's forces are computed only after everything else is free of
-    violations: a program solves for them, and then only objectives depend on them."""
+    """Return True if the contact model has no closed form, so that a program solves for forces.
+
+    The forces of a candidate are then computed only if its motion violates no constraint.
+    """
     return not contact_model(workcell).has_closed_form
 
 
 def force_sizes(workcell: Workcell) -> dict[str, int]:
-    """Return the outputs of `sample_functions`' `forces`, with their number of entries."""
+    """Return the number of entries of each output of one sample's forces, by the output's name.
+
+    These are the outputs of the function `forces` of `sample_functions`.
+    """
     torques = [f"joint_torque_{i}" for i in (1, 2)]
     sizes = _LOAD_SIZES | {name: sample_sizes(workcell)[name] for name in torques}
     return sizes | {"force_constraint": len(FORCE_CONSTRAINTS)}
