@@ -69,7 +69,7 @@ def names() -> tuple[str, ...]:
 
 
 def algorithms() -> dict[str, str]:
-    """Return the searches that `make` accepts: titles by name."""
+    """Return the printed title of each algorithm that `make` accepts, keyed by name."""
     return {name: entry.title for name, entry in REGISTRY.items()}
 
 
@@ -80,6 +80,10 @@ def title(name: str) -> str:
 
 def settings_of(name: str, overrides: Mapping[str, object] | None = None) -> AlgorithmSettings:
     """Return the effective settings of an algorithm: its defaults with `overrides`.
+
+    Args:
+        name: one of `names()`.
+        overrides: values by setting name that replace defaults; None for none.
 
     Raises:
         SettingsError: unknown algorithm or setting, or a value outside its range.
@@ -109,10 +113,10 @@ def make(
 
     Args:
         name: one of `names()`.
-        settings: from `settings_of`, or values that differ from the defaults, see
-            `REGISTRY`.
-        initial: (k, n_var) decision vectors that the first generation starts with, the rest
-            being uniformly random; None for all random.
+        settings: settings object of the algorithm, or only the values that differ from the
+            defaults, by setting name; None for the defaults.
+        initial: (k, n_var) decision vectors of the first generation. The rest of the first
+            generation is uniformly random. None for all random.
 
     Raises:
         SettingsError: as `settings_of`; wrong `initial` points are refused when the run starts.
@@ -153,10 +157,10 @@ class Evaluator(Protocol):
 
 
 def reject_non_finite(evaluations: Evaluations) -> Evaluations:
-    """Make every candidate with a non-finite figure infeasible.
+    """Mark every candidate with a non-finite figure as infeasible and return the evaluations.
 
-    No NaN or infinity of any evaluator can then look like a good candidate. Such candidates get
-    `WORST_PENALTY` and the reason `NOT_FINITE`.
+    Such a candidate gets `WORST_PENALTY` and the reason `NOT_FINITE`. An infeasible candidate may
+    have non-finite objectives.
     """
     finite = np.isfinite(evaluations.violation).all(axis=1)
     finite &= np.isfinite(evaluations.violation_time).all(axis=1)
@@ -180,17 +184,18 @@ def reject_non_finite(evaluations: Evaluations) -> Evaluations:
 class CarryProblem(Problem):  # type: ignore[misc]
     """A cell's candidates as a vectorised pymoo problem that stores its evaluations.
 
-    With handling 'penalty' the objectives are the penalised ones (paper Eq. 60) and there are no
-    constraints; with 'constraints' they are the plain ones, and each of `REASONS` is an
-    inequality constraint with its violation as value. Every figure handed out is finite.
+    With handling 'penalty', pymoo minimises the penalised objectives (paper Eq. 60) without
+    constraints. With handling 'constraints', pymoo minimises the plain objectives, or the penalised
+    ones of a candidate without finite objectives. Each of `REASONS` is then an inequality
+    constraint, and the violation is its value.
 
     Attributes:
-        evaluator: what evaluates.
-        drawn, task: task of the drawn candidates and of the evaluated ones, None for the same; see
-            `symbolic.path.pieces`.
-        handling: see above.
-        evaluated: called with the number of candidates after each batch.
-        batches: the evaluations of each call, in order.
+        evaluator: evaluator of the candidates.
+        drawn: coarse task, whose decision vectors pymoo draws; None if equal to the evaluated task.
+        task: task of the evaluated candidates, resampled from `drawn`; None if `drawn` is None.
+        handling: 'penalty' or 'constraints', as above.
+        evaluated: function called after each batch with the number of candidates in the batch.
+        batches: evaluations of each batch, in order.
     """
 
     def __init__(
@@ -203,7 +208,11 @@ class CarryProblem(Problem):  # type: ignore[misc]
         """Pose the problem.
 
         Args:
-            task: of the candidates, where only the waypoints of its file are drawn.
+            evaluator: evaluator of the candidates.
+            handling: 'penalty' or 'constraints'.
+            evaluated: function called after each batch with the number of candidates in the batch.
+            task: task of the evaluated candidates. If its path has several pieces, pymoo draws
+                decision vectors of the coarse task only. None draws the evaluator's variables.
         """
         self.task = task if task is not None and task.pieces > 1 else None
         self.drawn = None if self.task is None else coarse_task(self.task)

@@ -40,9 +40,9 @@ class Polisher:
     """Polishes fronts of one evaluator. A resource: reuse it for several fronts.
 
     Attributes:
-        evaluator: full model.
-        settings: effort and tolerances.
-        solver: of both peak forces; None in drivable cells.
+        evaluator: evaluator of candidates with the full model.
+        settings: settings of the polish.
+        solver: solver that minimises both peak forces; None in drivable cells.
         drive_method: step method of drivable carries; None under other time laws.
     """
 
@@ -55,7 +55,12 @@ class Polisher:
         settings: PolishSettings,
         functions: PolishFunctions | None = None,
     ) -> None:
-        """Load or build the functions.
+        """Prepare the polish of the evaluator's cell.
+
+        Args:
+            evaluator: evaluator of candidates with the full model.
+            settings: settings of the polish.
+            functions: compiled functions of the cell; None loads or builds them.
 
         Raises:
             SettingsError: the evaluator's objectives are not those of the polish: both peak forces,
@@ -76,8 +81,11 @@ class Polisher:
         self._timings = TimingModel(evaluator.compiled, self.drive_method.driver.timer.intervals)
 
     def recheck(self, x: Array) -> str:
-        """Return why a drivable decision vector's timing fails on the finer grid, else ''; see
-        `recheck_timing`."""
+        """Return why a drivable carry's timing fails on the finer grid; '' if the timing holds.
+
+        Args:
+            x: (n_var,) decision vector.
+        """
         assert self.drive_method is not None
         return recheck_timing(self.drive_method.driver, self._timings, x)
 
@@ -92,10 +100,10 @@ class Polisher:
 
         Args:
             front_x: (k, n_var) decision vectors; k may be 0.
-            rng: draws the starts of attempts at the balanced middle.
+            rng: random generator for the starts of attempts at the balanced middle.
             paths: (m, n_path) known good free waypoints, not necessarily on the front; only the
                 polish of drivable carries uses them. None for none.
-            on_progress: receives attempts done, and the expected total.
+            on_progress: function called with the attempts done and the expected total.
         """
         begin = time.perf_counter()
         x = np.asarray(front_x, dtype=float).reshape(-1, self.evaluator.n_var)

@@ -89,12 +89,14 @@ class PolishSettings:
     Attributes:
         attempts: at points, ends and middle of a front; probes and attempts between them are extra.
             For drivable carries the force limits of the sweep.
-        solver: of the programs of both peak forces: the dense interior-point method of
-            `hybrid_opt.polishing.solvers.dense`, or IPOPT.
-        rounds: trust-region iterations of one point at most; see `hybrid_opt.polishing.point`.
-        max_iterations: of the solver per program; see `FEASIBILITY_PATIENCE` of `solvers.base`.
+        solver: solver of the programs that minimise both peak forces: the dense
+            interior-point method of `hybrid_opt.polishing.solvers.dense`, or IPOPT.
+        rounds: greatest number of trust-region iterations at one point.
+        max_iterations: greatest number of solver iterations per program.
         clearance: distance to obstacles [m] that lets the motion between samples be certified.
-        probe, fill, drivable: settings of the parts.
+        probe: settings of the search for basins far from the front.
+        fill: settings of the filling of the front between its ends.
+        drivable: settings of the polish of drivable cells.
     """
 
     attempts: NumberOrNone = 8
