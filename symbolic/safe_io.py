@@ -82,7 +82,7 @@ def read_bytes(
 
     Args:
         path: the file, or a symbolic link to it.
-        most: largest size that is taken [bytes].
+        most: largest accepted size [bytes].
         judge: looks at the file that was opened before it is read, and may raise.
 
     Raises:
@@ -315,7 +315,7 @@ def replace_file(path: Path, content: bytes, mode: int = 0o666) -> None:
 
     Args:
         path: the file, in an existing folder.
-        content: of the file.
+        content: new content of the file.
         mode: permissions of the file, as far as the process's mask allows them.
 
     Raises:

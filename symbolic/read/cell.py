@@ -64,8 +64,8 @@ def load(
         path: the file; every path inside it is relative to its folder.
         checks: further checks of an otherwise valid workcell, e.g. inverse kinematics at the
             start; each yields its problems as `key.path: what was found; what is allowed`.
-        stored: whether it was unpacked from an archive: packages that `package_dirs` lacks are
-            not looked for on this machine, and xacro files were expanded before.
+        stored: whether the workcell was unpacked from an archive. If so, missing packages are not
+            looked for on this machine, and xacro files were expanded before.
         decided: per robot the start branch that takes the place of "search" in the file.
         text: what to read in the place of the file's content, as if it stood there.
         reach: whether fixed poses have to be within the arms' reach; False where spins of pads or
@@ -261,11 +261,11 @@ def changed_text(content: bytes, changes: Mapping[str, Any], file: str) -> bytes
     """Return the text of a workcell file with changed values of some keys; comments are lost.
 
     Args:
-        content: of the file.
+        content: content of the workcell file.
         changes: values by key path as in the file: 'payload.mass', 'task.goal'. An array of tables
             is followed by an index or by a table's name, or else every table is meant:
             'contacts[0].friction', 'contacts.friction', 'environment.top board.xyz'.
-        file: for messages.
+        file: name of the file, for messages.
 
     Raises:
         WorkcellError: with every path that leads nowhere.

@@ -65,8 +65,8 @@ def read_robot(table: TableReader, folder: Path, stored: bool = False) -> tuple[
     """Read one arm and the index of its start branch (-1: by criterion, -2: searched for).
 
     Args:
-        table: its section.
-        folder: what paths are relative to.
+        table: the arm's section of the workcell file.
+        folder: folder that relative paths in the section start from.
         stored: whether the cell was unpacked from an archive, see `symbolic.read.cell.load`.
     """
     name = table.text("name")
@@ -208,7 +208,7 @@ def _read_description(
 
     Args:
         table: the robot's section.
-        folder: what paths are relative to.
+        folder: folder that relative paths in the section start from.
         stored: whether the cell was unpacked from an archive, see `symbolic.read.cell.load`.
     """
     package_dirs = _read_folders(table, folder)
@@ -427,8 +427,8 @@ class NamedRobot:
 
     Attributes:
         path: the URDF or xacro file.
-        arguments: of the xacro file.
-        package_dirs: folders that hold the packages that it names.
+        arguments: arguments of the xacro file.
+        package_dirs: folders with the packages that the URDF or xacro file names.
     """
 
     path: Path
@@ -437,7 +437,7 @@ class NamedRobot:
 
 
 def named_robot(name: str) -> NamedRobot:
-    """Return the description of that name, downloading it if necessary.
+    """Return the robot description called `name`, downloading its files if necessary.
 
     Raises:
         OutsideError: none has that name, a package is missing, or the download failed.

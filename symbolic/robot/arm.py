@@ -72,7 +72,8 @@ def flange_target(
     """Compute the flange's target rotation (3, 3) and position (3,) in the robot's root frame.
 
     Args:
-        position, rotation: (3,) and (3, 3), the box in the world (paper Eqs. 30-33).
+        position, rotation: position (3,) [m] and rotation (3, 3) of the box in the world
+            (paper Eqs. 30-33).
     """
     T_box_flange = box_flange(robot, contact)
     R_root_world = number(robot.T_world_base[:3, :3].T)
@@ -97,9 +98,10 @@ def joint_torque(
     """Compute the joint torques (n,) that exert a contact wrench on the box (paper Eq. 45) [N m].
 
     Args:
-        jacobian: (6, n) of the flange in the robot's root frame, linear rows first.
-        rotation: R_world_box (3, 3).
-        wrench: (6,) on the box about the nominal contact point, world axes.
+        jacobian: Jacobian (6, n) of the flange in the robot's root frame, linear rows first.
+        rotation: rotation R_world_box (3, 3) of the box.
+        wrench: contact wrench (6,) on the box about the nominal contact point, world axes
+            [N, N m].
     """
     lever = ca.mtimes(rotation, number(flange_lever(robot, contact)))
     moment = wrench[3:] + ca.cross(lever, wrench[:3])
@@ -424,7 +426,7 @@ def _independent_axes(model: RobotModel) -> tuple[int, ...]:
 
 
 def following_columns(model: RobotModel, jacobian: ca.SX) -> ca.SX:
-    """Return the columns (6, 6) of a Jacobian (6, n) of the joints that follow the box."""
+    """Return the columns (6, 6) of a Jacobian (6, n) for the six joints that follow the box."""
     return jacobian[:, list(model.following)] if model.redundant else jacobian
 
 

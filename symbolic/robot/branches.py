@@ -192,9 +192,9 @@ def inverse_kinematics(
 
     Args:
         T_root_flange: (4, 4) wanted flange placement in the robot's root frame.
-        n_starts: number of starts of the search.
+        n_starts: number of start postures for Newton's method.
         redundant: positions of the arm's redundant joints by their indices [rad or m].
-        approach: of the arm; None for the interpreted one.
+        approach: the arm's approach function; None for CasADi's interpreter.
 
     Returns:
         (m, n) [rad], sorted lexicographically, each with a residual below `SOLUTION_TOLERANCE`
@@ -260,7 +260,7 @@ def start_branches(
     than once starts on the turn that keeps it farthest from its limits there.
 
     Args:
-        arm: 0 or 1.
+        arm: index of the arm, 0 or 1.
         search: the functions of the search; None for the interpreted functions, without clearance.
     """
     robot, contact = workcell.robots[arm], workcell.contacts[arm]

@@ -37,10 +37,10 @@ class RobotModel:
         model: Pinocchio's numeric model with the locked joints removed; not to be modified. Its
             gravity is expressed in the root.
         flange: name of the flange frame.
-        redundant: of each redundant joint of the arm its index in q and its place in the extended
-            pose.
+        redundant: one pair for each redundant joint of the arm: its index in q and its index in
+            the extended pose.
         pose_size: entries of the extended pose, 6 + m.
-        orientation: how its numbers 3 to 5 give the box's.
+        orientation: how entries 3 to 5 of the extended pose describe the rotation of the box.
     """
 
     name: str
@@ -52,7 +52,7 @@ class RobotModel:
 
     @property
     def joint_names(self) -> tuple[str, ...]:
-        """The n joints in the order of q."""
+        """Names of the n joints in the order of q."""
         return tuple(self.model.names)[1:]
 
     @property
@@ -62,7 +62,7 @@ class RobotModel:
 
     @cached_property
     def following(self) -> tuple[int, ...]:
-        """The six joints that follow the box, by their indices in q."""
+        """Indices in q of the six joints that follow the box."""
         set_apart = [joint for joint, _ in self.redundant]
         return tuple(k for k in range(self.n_joints) if k not in set_apart)
 
