@@ -253,8 +253,8 @@ class Evaluated:
     """Evaluated points in the order of their evaluation.
 
     Attributes:
-        decisions: (n, n_var).
-        objectives: (n, n_obj), as the problem returned them.
+        decisions: (n, n_var) decision vectors.
+        objectives: (n, n_obj) objectives as the problem returned them.
         violation: (n,) total constraint violation, 0 where feasible; infinite where an
             objective or constraint was not finite.
         generation: (n,) number of the generation, from 1.
@@ -301,11 +301,11 @@ def search(
     """Spend exactly `evaluations` evaluations of `problem`.
 
     Args:
-        problem: with `elementwise=False`; each generation is one call.
-        algorithm: a fresh one from `hybrid_opt.metaheuristics.make`.
-        evaluations: the budget, at least 1.
-        rng: the run's only source of randomness, or a seed for it; the same seed gives the
-            same result to the bit.
+        problem: pymoo problem with `elementwise=False`; each generation is one call.
+        algorithm: algorithm from `hybrid_opt.metaheuristics.make` that has not run yet.
+        evaluations: number of evaluations, at least 1.
+        rng: random generator of the whole run, or a seed. The same seed gives the same result to
+            the bit.
 
     Raises:
         SettingsError: no budget, or an algorithm that already ran.
@@ -372,13 +372,20 @@ def search_carries(
     evaluated: Callable[[int], None] = lambda count: None,
     task: Task | None = None,
 ) -> tuple[Evaluations, NDArray[np.intp]]:
-    """Spend exactly that many evaluations and certify the front of all of them; return the
-    candidates in order and the generation (n,) of each, from 1.
+    """Search with exactly `evaluations` evaluations and certify the front of all candidates.
 
     Args:
-        algorithm: one of `hybrid_opt.metaheuristics.names()`.
-        evaluated: called with the number of candidates after each batch.
-        task: of the candidates, where only its stated waypoints are drawn.
+        evaluator: evaluator of the candidates.
+        algorithm: name of the algorithm, one of `hybrid_opt.metaheuristics.names()`.
+        evaluations: number of evaluations, at least 1.
+        rng: random generator of the whole run.
+        settings: settings of the search.
+        evaluated: function called after each batch with the number of candidates in the batch.
+        task: task of the candidates; with several path pieces only the coarse task's decision
+            vectors are drawn. None draws the evaluator's variables.
+
+    Returns:
+        The evaluations of all candidates in order, and the generation (n,) of each, from 1.
 
     Raises:
         SettingsError: an unknown algorithm or a value that is not allowed.
