@@ -62,7 +62,7 @@ def screening_functions(
 
     The first two take pose (6,), q_1 and q_2 (n,) [m, rad] of one sample.
     clearance: -> clearance (n_near,), lower bounds of the distances of the possible pairs that are
-    near [m], in order. far_clearance: likewise of the others, where there are any.
+    near [m], in order. far_clearance: the same bounds for the other possible pairs, if any [m].
     piece_poses: -> quaternions (4, n_pieces) as w x y z, positions (3, n_pieces) [m]: every
     piece of every body in the world, in the bodies' order.
     motion, far_motion: see `symbolic.geometry.clearance.motion_function`.
@@ -70,8 +70,8 @@ def screening_functions(
     Args:
         softness: `EXACT` for screening; `Softness(width)` for bounds that are smooth, and lower
             by some multiples of the width [m].
-        joint_placements: of each robot, `RobotModel.joint_placements`.
-        screen: of the geometry, or the same with symbols; None to find it.
+        joint_placements: the function `RobotModel.joint_placements` of each robot.
+        screen: screen of the geometry, with numbers or symbols; None to compute the screen here.
     """
     screen = screen_of(geometry) if screen is None else screen
     pose = ca.SX.sym("pose", 6)
@@ -202,7 +202,7 @@ class DistanceBounds:
         """Compute the gap between the payload and a fixed box along a direction.
 
         Args:
-            obstacle: (BOX_NUMBERS,) of the box, see `box_numbers`; may be symbols.
+            obstacle: numbers (BOX_NUMBERS,) of the fixed box from `box_numbers`; may be symbols.
             direction: (3,) unit vector from the box towards the payload.
         """
         rotation, centre = ca.reshape(obstacle[:9], 3, 3).T, obstacle[9:12]
@@ -405,9 +405,9 @@ def motion_function(
     Inputs: pose_a (6,), q_1_a, q_2_a (n,), then pose_b, q_1_b, q_2_b [m, rad].
 
     Args:
-        screen: of the geometry.
-        name: of the function.
-        pairs: among the possible ones.
+        screen: screen of the geometry.
+        name: name of the new function.
+        pairs: indices among the possible pairs.
     """
     ends = []
     for end in ("a", "b"):

@@ -46,10 +46,10 @@ class CoverSolid:
     """A simple shape in a frame.
 
     Attributes:
-        kind: of the shape.
-        size: half edges (3,) of a box, radius and half the length (2,) of others [m].
-        centre: (3,) [m].
-        rotation: (3, 3) axes as columns; None where they are the frame's.
+        kind: name of the shape.
+        size: half edges (3,) of a box, or radius and half length (2,) of another shape [m].
+        centre: centre (3,) of the shape in the frame [m].
+        rotation: axes (3, 3) of the shape as columns; None for the axes of the frame.
     """
 
     kind: type
@@ -92,7 +92,7 @@ class Obstacle:
         extent: (2, 3) least and largest coordinate along these [m].
         cover: a simple shape that contains it.
         to_own: (3, 3) from the world to its own axes, None where these are the world's.
-        offset: (3,) of the world's origin there [m].
+        offset: position (3,) of the world's origin in the piece's own axes [m].
     """
 
     kind: type
@@ -137,7 +137,7 @@ class ScreenBody(ContentRecord):
 
 @dataclass(frozen=True)
 class ScreenBase:
-    """Where an arm stands. rotation: (3, 3); position: (3,) [m]."""
+    """Pose of an arm's base in the world. rotation: (3, 3); position: (3,) [m]."""
 
     rotation: Any
     position: Any
@@ -148,10 +148,10 @@ class Screen:
     """A cell's bodies and pairs.
 
     Attributes:
-        bases: of both arms.
-        turning: which of their joints turn.
-        bodies: in the geometry's order.
-        pairs: the possible ones, as indices of bodies.
+        bases: pose of each arm's base.
+        turning: for each arm, True for each joint that turns, False for one that slides.
+        bodies: all bodies, in the geometry's order.
+        pairs: possible pairs, as indices of bodies.
         own: per pair within an arm whether its bound is the finer one, else None.
         payload: the payload's box.
         payload_is_mesh: whether that follows from a file.

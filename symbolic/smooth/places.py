@@ -61,9 +61,9 @@ class PathPointSymbols:
 
     Attributes:
         model: arms and bodies of the cell.
-        pose: (6,) of the box [m, rad].
-        rate: (6,) derivative of the pose by the path parameter.
-        q: joints of both arms, (n,) each [rad].
+        pose: pose (6,) of the box [m, rad].
+        rate: derivative (6,) of the pose with respect to the path parameter.
+        q: joint positions (n,) of each arm [rad].
     """
 
     def __init__(self, model: CellBodies) -> None:
@@ -207,11 +207,11 @@ class JointLimit(PathConstraint):
         return np.concatenate([[-slope[self.joint] * limit[self.joint]], slope])
 
     def arms(self, model: CellBodies) -> tuple[int, ...]:
-        """Return the joint's arm."""
+        """Return the index of the joint's arm, as a tuple of one entry."""
         return (self.arm,)
 
     def given(self, model: CellBodies) -> dict[str, ca.SX]:
-        """Return nothing: the limit is a parameter of the row itself."""
+        """Return an empty dictionary: the limit is a parameter of the row itself."""
         return {}
 
 
@@ -240,7 +240,7 @@ class ManipulabilityLimit(PathConstraint):
         return (manipulability(jacobian) / least) ** 2 - 1.0
 
     def arms(self, model: CellBodies) -> tuple[int, ...]:
-        """Return the arm."""
+        """Return the index of the arm, as a tuple of one entry."""
         return (self.arm,)
 
     def given(self, model: CellBodies) -> dict[str, ca.SX]:
