@@ -98,7 +98,7 @@ Row = Annotated[Array, Shape((None,))]
 
 
 def interpolated(at: Array, along: Array, values: Array) -> Array:
-    """Interpolate values (n, ...) given at ascending places (n,) linearly at places (m,)."""
+    """Interpolate values (n, ...), known at ascending `along` (n,), linearly at `at` (m,)."""
     found = np.empty((len(at), *values.shape[1:]))
     for column in np.ndindex(values.shape[1:]):
         every = (slice(None), *column)
@@ -123,7 +123,8 @@ def require_allowed(settings: object, whose: str = "") -> None:
     `Literal`, or outside a `Range`. None is allowed if the annotation allows it.
 
     Args:
-        whose: the settings are, in front of the message.
+        settings: the settings record.
+        whose: text at the front of the message, which names the owner of the settings.
 
     Raises:
         SettingsError: with the value and the allowed ones.

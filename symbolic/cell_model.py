@@ -31,7 +31,7 @@ class CellBodies:
     """A cell's arms and bodies, independent of the start postures.
 
     Attributes:
-        workcell: the description.
+        workcell: description of the cell.
         robots: the models of the two arms.
         geometry: the collision bodies and the pairs to be checked.
     """
@@ -59,7 +59,7 @@ class CellModel(CellBodies):
     Attributes:
         branches: per arm every branch at the start, best first.
         start: (n,) joint positions of each arm at the first waypoint [rad].
-        given: the group of these where they are symbols.
+        given: the parameter group of the start postures where these are symbols.
     """
 
     branches: tuple[tuple[StartBranch, ...], tuple[StartBranch, ...]]
@@ -71,8 +71,8 @@ def build_cell_bodies(workcell: Workcell, known: CellBodies | None = None) -> Ce
     """Read the robots and the bodies, in a fifth of the time of the whole model.
 
     Args:
-        known: bodies of a cell that differs in its path or in how it holds the box. Functions are
-            shared where the same pairs can meet.
+        known: arms and bodies of a cell that differs in its path or in how it holds the box.
+            Functions are shared where the same pairs can meet.
 
     Raises:
         RobotModelError: a URDF does not give an arm.
@@ -105,8 +105,9 @@ def build_cell_model(
     The workcell's `start_branch` selects one of the ranked branches; -1 is the best.
 
     Args:
-        bodies: of the same cell, if they are known; its path may be another one.
-        searches: what both arms' branches are found with; None for the interpreted functions.
+        bodies: arms and bodies of the same cell, if known; the path of that cell may differ.
+        searches: search functions of both arms' start branches; None for the interpreted
+            functions.
 
     Raises:
         RobotModelError: a URDF does not give an arm.
@@ -160,7 +161,8 @@ def own_clearance(geometry: CellGeometry, arm: int, bounds: Bounds) -> Clearance
     out.
 
     Args:
-        bounds: of all pairs, from poses (n, 6) and both arms' joints.
+        bounds: function from box poses (n, 6) and both arms' joints to the distance bounds of
+            all pairs.
     """
     rows = own_pairs(geometry, arm)
 

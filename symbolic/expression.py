@@ -26,7 +26,7 @@ def named_function(
     """Build a function from named inputs and outputs, in order.
 
     Args:
-        cse: whether what occurs several times is computed once.
+        cse: whether common subexpressions are computed once.
     """
     sides = [*inputs.values()], [*outputs.values()], [*inputs], [*outputs]
     return ca.Function(name, *sides, {"cse": cse})
@@ -45,7 +45,7 @@ def sx_parameters(*records: Any) -> dict[str, ca.SX]:
 
 
 def mx_parameters(*records: Any) -> dict[str, ca.MX]:
-    """Return the same groups as new MX symbols, for functions that only pass them on."""
+    """Return the groups of `sx_parameters` as new MX symbols, for functions that pass them on."""
     return mx_symbols(sx_parameters(*records))
 
 

@@ -280,7 +280,7 @@ def kernel_numbers(workcell: Workcell, screen: Screen) -> dict[str, tuple[str, .
     order.
 
     Args:
-        workcell, screen: with numbers.
+        workcell, screen: the cell and its distance bounds, with parameters.
     """
     arms, held = tuple(sx_parameters(*workcell.robots)), tuple(sx_parameters(workcell.payload))
     bodies = tuple(sx_parameters(screen))

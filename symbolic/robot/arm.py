@@ -364,7 +364,7 @@ def pose_error(R_target: ca.SX, p_target: ca.SX, R: ca.SX, p: ca.SX) -> tuple[ca
 
 
 def newton_step(model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX) -> ca.SX:
-    """Make one safeguarded Newton step of the inverse kinematics; q (n,) to q (n,)."""
+    """Return the joints (n,) after one safeguarded Newton step of the inverse kinematics."""
     R, p = model.placement(q)
     error, _ = pose_error(R_target, p_target, R, p)
     Q, upper = ca.qr(following_columns(model, model.jacobian(q)))

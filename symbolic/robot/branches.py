@@ -100,7 +100,10 @@ class ArmSearch:
     """Functions with which start branches of an arm are found.
 
     Attributes:
-        approach, follow, poses, clearance: see there.
+        approach: function of Newton steps towards a flange placement (type `Approach`).
+        follow: function of the arm's motion along extended poses (type `Follow`).
+        poses: function from waypoints to all samples of the path (type `Poses`).
+        clearance: function of the arm's least clearance bound [m]; None for no bound.
         found: postures (m, n) by what they were searched for, which others look up.
     """
 
