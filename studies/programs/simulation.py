@@ -73,7 +73,7 @@ def simulate_arms(
     MJCF.
 
     Raises:
-        WitnessError: with --sweep, the box holds at the lower or slips at the upper factor.
+        SimulationError: with --sweep, the box holds at the lower or slips at the upper factor.
     """
     control, leader, workcell = options.controller, options.leader - 1, cell.workcell
     witness = CellSimulation(workcell, settings)

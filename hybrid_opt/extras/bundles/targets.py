@@ -140,7 +140,7 @@ RUN = "run_job.py looks at both arms a hundred times a second and replaces their
 
 
 CYCLE_SKEW = 0.002
-"""Skew of two drivers whose goals bear one start: a cycle of the slower one [s]."""
+"""Largest skew of two drivers with the same start time in their goals: one cycle [s]."""
 
 
 _TORQUE = Target(

@@ -167,7 +167,7 @@ class CellSimulation:
                 world frame [m/s^2].
 
         Raises:
-            WitnessError: MuJoCo is not installed, or torques are unknown.
+            SimulationError: MuJoCo is not installed, or torques are unknown.
         """
         if not np.isfinite(workcell.stack_joint_limits("torque_max")).all():
             raise SimulationError(

@@ -111,7 +111,7 @@ def bisected(
         steps: number of bisections.
 
     Raises:
-        WitnessError: the box holds at the lower or slips at the higher factor.
+        SimulationError: the box holds at the lower or slips at the higher factor.
     """
     slips, holds = simulate(low), simulate(high)
     if slips.holds or not holds.holds:
@@ -127,7 +127,7 @@ def mujoco_module() -> ModuleType:
     """Import the simulator.
 
     Raises:
-        WitnessError: it is not installed.
+        SimulationError: it is not installed.
     """
     try:
         import mujoco
@@ -350,7 +350,8 @@ class BoxSimulation:
             disturbance: (3,) acceleration beside the motion's, world frame [m/s^2].
 
         Raises:
-            WitnessError: MuJoCo is not installed.
+            SimulationError: MuJoCo is not installed.
+            SettingsError: the hands of the cell hold by themselves.
         """
         self.workcell = workcell
         self.settings = settings or SimulationSettings()

@@ -365,7 +365,7 @@ def driven_carry(cell: Cell, x: Array) -> Carry:
     """Compute a decision vector's carry from rest to rest, timed as in a job.
 
     Raises:
-        WitnessError: there is none.
+        SimulationError: there is none.
         JobError: there is none without jumps of acceleration.
     """
     return exported_carry(cell, driven_timing(cell.timing_model, x))
@@ -375,7 +375,7 @@ def exported_carry(cell: Cell, timing: Timing) -> Carry:
     """Compute the carry of a timing, timed as in a job.
 
     Raises:
-        WitnessError: there is none.
+        SimulationError: there is none.
         JobError: there is none without jumps of acceleration.
     """
     if not timing.ok or timing.carry is None:
