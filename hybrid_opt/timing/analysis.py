@@ -44,24 +44,28 @@ from symbolic.path.pieces import resample_decisions
 from symbolic.records import Workcell
 
 LEAST_FORCE_RATIO = 1.001
-"""Least force limit of the curve over the force at rest: below, the motion has to creep."""
+"""Smallest force limit of the curve, as a multiple of the force at rest. Below it the box would
+have to creep."""
 
 
 REST_SPEED = 1e-3
-"""Joint speed over its limit below which an arm counts as at rest."""
+"""An arm counts as at rest if every joint is slower than this share of its speed limit."""
 
 
 @dataclass(frozen=True)
 class ForceCurve:
-    """Duration of the fastest timing against the limit on the normal forces, robust ones if the
-    model limits these.
+    """Durations of the fastest timings of one path under several limits on the normal forces.
+
+    If the timing model is robust, the limits bound robust forces, else planned forces.
 
     Attributes:
-        force: (n,) limits [N].
-        duration: (n,) [s], infinite without a timing.
-        status: outcome per limit.
-        static_force: largest limited force at rest anywhere on the path [N].
-        unlimited_force: largest limited force of the fastest timing without force limit [N].
+        force: (n,) force limits [N].
+        duration: (n,) duration of the fastest timing within each force limit [s]; infinite if there
+            is no timing.
+        status: outcome of each timing.
+        static_force: largest normal force at rest anywhere on the path [N].
+        unlimited_force: largest normal force of the fastest timing without force limit [N]; NaN if
+            the path has no timing.
     """
 
     force: Row
@@ -72,11 +76,11 @@ class ForceCurve:
 
 
 def check_search_timing(model: TimingModel, x: Array) -> Timing:
-    """Check the search's own timing (the task's time law) against every limit of the workcell.
+    """Check the timing under which the search evaluated x against every limit of the workcell.
 
     Returns:
-        Status `OK` or `EXCEEDED`, the latter also for a carry that starts or ends at speed, or the
-        path's own error; with the utilisation of every limit.
+        Timing with the utilisation of every limit. Its status is `OK`; `EXCEEDED` if a limit is
+        exceeded or if the carry does not start and end at rest; or the error of the path itself.
 
     Raises:
         SettingsError: x does not fit the workcell.
@@ -97,8 +101,8 @@ def check_search_timing(model: TimingModel, x: Array) -> Timing:
 
 
 def _jump(model: TimingModel, carry: Carry) -> Place | None:
-    """Return the joint with the largest relative speed at the carry's ends; None if all are at
-    rest."""
+    """Return the joint that moves fastest, relative to its speed limit, at the start or end of the
+    carry; None if all joints are at rest there."""
     limit = model.workcell.stack_joint_limits("velocity_max")
     ends = np.abs(carry.stack_arms("q_rate")[[0, -1]]) / limit
     if float(ends.max()) < REST_SPEED:
@@ -111,8 +115,10 @@ def _jump(model: TimingModel, carry: Carry) -> Place | None:
 
 
 def drivable_timing(model: TimingModel, x: Array) -> Timing:
-    """Time a drivable carry x (n_var,) within its own force limit: as the search timed it if that
-    holds between its grid points, else by `time_path`.
+    """Time a drivable carry x (n_var,) within its own force limit.
+
+    The search's timing is kept if it satisfies the limits between its grid points too. Otherwise
+    the path is timed again by `time_path`.
 
     Raises:
         SettingsError: x does not fit the workcell.
@@ -130,24 +136,26 @@ def drivable_timing(model: TimingModel, x: Array) -> Timing:
 
 
 def closest_to_reference_timing(model: TimingModel, x: Array) -> Timing:
-    """Compute the fastest timing from rest to rest that never exceeds the task's reference speeds,
-    so that the box moves at a reference speed wherever limits allow it."""
+    """Compute the fastest timing from rest to rest that never exceeds the task's reference speeds.
+    The box moves at a reference speed wherever the other limits allow it."""
     return time_path(model, x, TimingLimits(reference_speed=True))
 
 
 def duration_against_force_limit(
     model: TimingModel, x: Array, points: int = 12, on_timing: Callable[[], None] = lambda: None
 ) -> ForceCurve:
-    """Compute durations of the fastest timings between the least feasible force and the unlimited
-    one.
+    """Compute the fastest timing under each of several limits on the normal forces.
 
-    The limits are spaced evenly in the logarithm of the force above rest.
+    The limits lie between the force at rest and the largest force of the unlimited timing. Their
+    excess over the force at rest is spaced evenly in its logarithm.
 
     Args:
-        on_timing: called after every point.
+        x: (n_var,) decision vector.
+        points: number of force limits.
+        on_timing: called after every timing.
 
     Raises:
-        SettingsError: fewer than two points.
+        SettingsError: fewer than two points, or x does not fit the workcell.
     """
     if points < 2:
         raise SettingsError(f"{points} points of the force curve; give at least 2", code="too-few")
@@ -174,24 +182,26 @@ def duration_against_force_limit(
 
 
 def _peak_force(model: TimingModel, carry: Carry) -> float:
-    """Return the largest force that the model limits [N]."""
+    """Return the largest normal force of a carry [N]; the largest robust force if the model is
+    robust."""
     return float(model.carry_limits.limited_force(carry, model.drive_limits(1.0)).max())
 
 
 @dataclass(frozen=True)
 class TimedTrajectory:
-    """A trajectory under the search's timing and under drivable timings.
+    """One trajectory under the search's timing and under drivable timings.
 
     Attributes:
-        workcell: the cell.
-        nominal_duration: at the reference speeds without ramps [s].
-        timings: by name: the search's first (`check_search_timing`), then drivable ones.
-        jerk: of a drivable carry within its force limit and the cell's limits on jerk; None under
-            other time laws, and without such limits.
-        margins: largest errors of the cell's description under the timing closest to the reference
-            speeds; empty without that timing.
-        curve: duration against force limit, None if not computed.
-        validations: by name, of the timings of `time_path` by TOPP-RA.
+        workcell: the workcell.
+        nominal_duration: duration of a motion at the reference speeds without ramps [s].
+        timings: timing by name. The first is the search's own (`check_search_timing`), the others
+            are drivable.
+        jerk: timing of a drivable carry within its force limit and the workcell's jerk limits; None
+            if the time law is not drivable or the workcell has no jerk limits.
+        margins: largest errors of the workcell's description that the timing closest to the
+            reference speeds tolerates; empty if there is no such timing.
+        curve: duration against force limit; None if not computed.
+        validations: comparison with TOPP-RA, by name of the timing.
     """
 
     workcell: Workcell
@@ -211,15 +221,17 @@ def time_trajectory(
     own: TimingModel | None = None,
     progress: ShowProgress = False,
 ) -> TimedTrajectory:
-    """Time one decision vector (n_var,) in every way.
+    """Time one decision vector in every way that the workcell's time law offers.
 
     Args:
-        model: of the driven cell.
-        force_limit: normal force [N] of a force-limited timing, None for no such timing.
-        curve_points: points of the curve of duration against force limit, None for no curve.
-        own: of the cell that x was found in, None for the same.
-        progress: True for a bar, or a function of finished and all timings, with the margins as
-            one.
+        model: timing model of the drivable workcell.
+        x: (n_var,) decision vector.
+        force_limit: normal force [N] for one more timing within this limit; None for no such
+            timing.
+        curve_points: points of the curve of duration against force limit; None for no curve.
+        own: timing model of the workcell in which the search found x; None if it is `model`.
+        progress: True for a progress bar, or a function of the finished and the total number of
+            timings. The margins count as one timing.
 
     Raises:
         SettingsError: x does not fit the workcell, or the limit is not a positive force.
@@ -269,14 +281,15 @@ def time_trajectory(
 
 @dataclass(frozen=True)
 class StoredTiming:
-    """One stored `Timing`. Fields after `use` belong to its carry, None without one.
+    """One stored `Timing`. The fields after `use` describe its carry and are None if there is no
+    carry.
 
     Attributes:
-        status, reason, iterations, slowed, seconds: as of `Timing`.
-        duration: [s], NaN without a timing.
-        use: by limit.
+        status, reason, iterations, slowed, seconds: the fields of `Timing` of these names.
+        duration: [s], NaN if there is no timing.
+        use: largest value over its limit, by name of the limit.
         objectives: (2,) largest normal forces over the reference forces.
-        payload_limit: [kg].
+        payload_limit: largest payload mass [kg] at the same timing.
         peak_normal_force, peak_resultant_force: (2,) [N].
         least_friction_margin: (2,) least unused share of the friction.
         peak_pressure_shift: (2,) [m].
@@ -304,13 +317,13 @@ class StoredTiming:
 
 @dataclass(frozen=True)
 class StoredJerk:
-    """A stored timing within limits on jerk; see `hybrid_opt.timing.records.JerkTiming`.
+    """A stored timing within jerk limits: the record of a `JerkTiming`.
 
     Attributes:
-        status: of its timing.
-        duration: [s].
-        without: duration without limits on jerk [s]; both NaN without a timing.
-        joint_use, payload_use: largest jerks over their limits.
+        status: outcome of the timing.
+        duration: [s], NaN if there is no timing.
+        without: duration of the fastest timing without jerk limits [s], NaN if there is none.
+        joint_use, payload_use: largest joint jerk and payload jerk over their limits.
     """
 
     status: TimingStatus
@@ -322,15 +335,15 @@ class StoredJerk:
 
 @dataclass(frozen=True)
 class TimingDocument:
-    """All timings of one trajectory; see `TimedTrajectory`.
+    """All timings of one trajectory in stored form: the record of a `TimedTrajectory`.
 
     Attributes:
-        nominal_duration: at the reference speeds without ramps [s].
-        timings: by name, the search's first.
-        margins: largest errors of the cell's description.
-        force_curve: duration against force limit, None if not computed.
-        jerk: timing of a drivable carry within the cell's limits on jerk, None without.
-        validations: by name, of timings by TOPP-RA.
+        nominal_duration: duration of a motion at the reference speeds without ramps [s].
+        timings: timings by name, the search's first.
+        margins: largest errors of the workcell's description that the carry tolerates.
+        force_curve: duration against force limit; None if not computed.
+        jerk: timing of a drivable carry within the workcell's jerk limits; None if there are none.
+        validations: comparison with TOPP-RA, by name of the timing.
     """
 
     nominal_duration: Figure
@@ -342,7 +355,7 @@ class TimingDocument:
 
 
 def timing_document(timed: TimedTrajectory) -> TimingDocument:
-    """Return the record of a timed trajectory."""
+    """Convert a timed trajectory to the record that is stored."""
     jerk = timed.jerk
     timings = {name: stored_timing(timing) for name, timing in timed.timings.items()}
     found = TimingDocument(
@@ -362,14 +375,14 @@ def read_timing(path: Path) -> TimingDocument:
     """Read one file of `timing/` in a results folder.
 
     Raises:
-        ResultsError: it is missing or damaged.
+        ResultsError: the file is missing or damaged.
     """
     remedy = "delete stages/timing.json in its folder and continue the study with --resume"
     return read_record(TimingDocument, path, remedy)
 
 
 def stored_timing(timing: Timing) -> StoredTiming:
-    """Return the record of one timing."""
+    """Convert a timing to the record that is stored."""
     same = ("status", "reason", "duration", "iterations", "slowed", "seconds", "use")
     known = StoredTiming(*(getattr(timing, name) for name in same))
     carry = timing.carry

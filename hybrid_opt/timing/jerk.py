@@ -58,7 +58,7 @@ if TYPE_CHECKING:
 Mask = NDArray[np.bool_]
 
 SPLINE_SUPPORT = 4
-"""Nonzero basis functions of a cubic spline at a place; they are neighbours."""
+"""Number of basis functions of a cubic spline that are nonzero at a point. They are neighbours."""
 
 SPLINE_PIECES = 60
 """Pieces of the spline of squared speeds."""
@@ -74,7 +74,7 @@ DURATION_TOLERANCE = 1e-4
 """Relative change of the duration at which iterations end."""
 
 MAX_TIGHTENINGS = 4
-"""Times that a timing is recomputed with tighter limits where it exceeded them."""
+"""How often a timing is recomputed with tighter limits if it exceeds limits between the points."""
 
 START_UTILISATION = 0.5
 """Largest utilisation of a limit by the slow first timing."""
@@ -87,7 +87,7 @@ NEAR_ACTIVE_SHARE = 0.95
 place a timing under a force limit, to which most cones are near, took three times as long."""
 
 LEAST_COEFFICIENT_SHARE = 0.05
-"""Least share of its last value of a coefficient."""
+"""Smallest value of a coefficient after a step, as a share of its value before the step."""
 
 
 def time_with_jerk(
@@ -101,10 +101,12 @@ def time_with_jerk(
 
     Args:
         x: (n_var,) decision vector.
-        fastest: the timing without limits on jerk, if known.
+        limits: limits in addition to the workcell's.
+        jerk: jerk limits of joints and payload.
+        fastest: the timing without jerk limits; computed if None.
 
     Raises:
-        SettingsError: x does not fit the workcell, or limited robust forces have no slopes.
+        SettingsError: x does not fit the workcell, or limited robust forces have no derivatives.
     """
     motion = model.path_motion(x)
     fastest = fastest or time_path(model, x, limits, motion)
@@ -115,8 +117,8 @@ def time_with_jerk(
 
 
 def applicable_jerk_limits(workcell: Workcell, limits: TimingLimits) -> JerkLimits | None:
-    """Return the cell's limits on jerk for timings within `limits`; None without any, or if limited
-    robust forces have no slopes."""
+    """Return the workcell's jerk limits for timings within `limits`; None if the workcell has no
+    jerk limits, or if `limits` bound robust forces without derivatives."""
     slopes = command_model(workcell).has_scalar_squeeze or not limits.robust
     return JerkLimits.from_workcell(workcell) if slopes else None
 
@@ -135,8 +137,8 @@ class _JerkProblem:
         )
 
     def solve(self) -> JerkTiming:
-        """Iterate until the duration settles; then with tighter limits where the answer exceeds
-        them between the points, as often as that helps."""
+        """Iterate until the duration settles. Repeat with tighter limits where the result exceeds
+        limits between the points, as long as that helps."""
         c = np.ones(self._coarse.value.shape[1])
         c, rounds = self._iterate(self._start_factor(c) * c)
         for _ in range(MAX_TIGHTENINGS):
@@ -163,8 +165,8 @@ class _JerkProblem:
         return c, rounds
 
     def _step(self, c: Array) -> Array | None:
-        """Return better coefficients than c (k,) that satisfy all limits at the coarse points; None
-        without any."""
+        """Return spline coefficients (k,) with a shorter duration than c (k,) that satisfy all
+        limits at the coarse points; None if the program has no solution."""
         at, rows = self._coarse, JerkProgram(len(c))
         self._motion_rows(rows)
         self._force_rows(c, rows)
@@ -217,7 +219,7 @@ class _JerkProblem:
             _add_linearised(at, c, sign * value[:, near], sign * by, rows)
 
     def _jerk_rows(self, c: Array, rows: JerkProgram) -> None:
-        """Add jerk over sqrt(v) below the tangent of the limit over sqrt(v) at c."""
+        """Limit |jerk| / sqrt(v) by the tangent of (limit / sqrt(v)) at c."""
         at, jerk, v = self._coarse, self._jerk, self._coarse.value @ c
         # Multiplied by sqrt(v) of the last round, so that rows are of order one.
         root = np.sqrt(v)
@@ -231,7 +233,8 @@ class _JerkProblem:
             rows.add_norm_bounds(box, np.zeros((len(v), 3)), head, level, at.first_basis)
 
     def _excess(self, c: Array) -> Array:
-        """Return the largest utilisation (coarse points,) at the finer points around each."""
+        """Return for each coarse point the largest utilisation (n,) of any limit at the finer
+        points next to it."""
         carry = self._carry(self._fine, c)
         ratios = self._model.carry_limits.ratios(carry, self._limits)
         del ratios[FRICTION_RATIO]
@@ -241,7 +244,8 @@ class _JerkProblem:
         return np.asarray(np.maximum(np.append(use[0], between), np.append(between, use[-1])))
 
     def _start_factor(self, c: Array) -> float:
-        """Return a factor on the squared speeds with low utilisation, as at rest."""
+        """Return a factor on the squared speeds of coefficients c at which all limits are little
+        used."""
         factor = 1.0
         rest = self._most_used(self._coarse, 0.0 * c)
         allowed = rest + START_UTILISATION * (1.0 - rest)
@@ -253,7 +257,8 @@ class _JerkProblem:
         return self._model.carry(at.motion, at.time(c), at.speed(c), at.acceleration(c))
 
     def _jerks(self, at: WarpedPath, c: Array) -> tuple[Array, Array]:
-        """Return the largest joint jerk and payload jerk (n,) over their limits."""
+        """Return at each point (n,) the largest joint jerk over its limit, and the payload jerk
+        over its limit."""
         joint, box = at.jerk(c)
         stack_joint_limits = (np.abs(joint) / self._jerk.joints).max(axis=1)
         return stack_joint_limits, np.linalg.norm(box, axis=1) / self._jerk.payload
@@ -267,8 +272,8 @@ class _JerkProblem:
         return max(self._check(at, c)[1:])
 
     def _feasible_speed_factor(self, c: Array) -> float:
-        """Return the largest factor on the speeds with which the timing satisfies all limits on the
-        finer grid."""
+        """Return the largest factor on the speeds, at most one, with which the timing satisfies all
+        limits on the finer grid."""
         jerk = max(float(jerk.max()) for jerk in self._jerks(self._fine, c))
 
         def use(f: float) -> float:
@@ -280,7 +285,8 @@ class _JerkProblem:
         return largest_speed_factor(use)
 
     def _checked_timing(self, c: Array) -> JerkTiming:
-        """Return the timing on the finer grid, slowed down if it exceeds a limit."""
+        """Check the timing of coefficients c on the finer grid, and slow it down if it exceeds a
+        limit."""
         factor = self._feasible_speed_factor(c)
         timing, *uses = self._check(self._fine, factor**2 * c)
         status = TimingStatus.OK if factor >= LEAST_SPEED_FACTOR else TimingStatus.NOT_CONVERGED
@@ -294,16 +300,17 @@ class _JerkProblem:
 
 @dataclass(frozen=True)
 class WarpedPath:
-    """Places along the warped path; all arrays by place.
+    """Samples of a path along its warped parameter s, and linear maps from the spline's
+    coefficients to the motion at the samples. There are n samples and k coefficients.
 
     Attributes:
-        s: in [0, 1].
-        value: (n, k) basis of v.
-        squared_by, acceleration_by: (n, k) from coefficients to u'^2 and u''.
-        motion: geometry by u.
-        columns: (n, SPLINE_SUPPORT) coefficients with influence at each place.
-        joint_jerk_by, box_jerk_by: (n, joints, SPLINE_SUPPORT), (n, 3, SPLINE_SUPPORT) jerk over
-            sqrt(v), by these coefficients.
+        s: (n,) warped parameter in [0, 1].
+        value: (n, k) maps coefficients to v = s'^2.
+        squared_by, acceleration_by: (n, k) map coefficients to u'^2 and to u''.
+        motion: geometry of the path at the samples, differentiated by u.
+        columns: (n, SPLINE_SUPPORT) indices of the coefficients that influence each sample.
+        joint_jerk_by, box_jerk_by: (n, joints, SPLINE_SUPPORT) and (n, 3, SPLINE_SUPPORT), map
+            these coefficients to jerk / sqrt(v).
         keep: (n,) share of every limit that a program may use.
     """
 
@@ -319,7 +326,7 @@ class WarpedPath:
 
     @classmethod
     def from_motion(cls, motion: PathMotion, intervals: int) -> WarpedPath:
-        """Sample both ends of equal intervals along a path."""
+        """Sample a path at the ends of equal intervals of s, both ends of the path included."""
         s, inner = np.linspace(0.0, 1.0, intervals + 1), np.linspace(0.0, 1.0, SPLINE_PIECES + 1)
         knots = np.concatenate([np.zeros(3), inner, np.ones(3)])
         splines = BSpline(knots, np.eye(len(knots) - 4), 3)
@@ -358,18 +365,17 @@ class WarpedPath:
 
     @property
     def first_basis(self) -> NDArray[np.intp]:
-        """Return the first coefficient (n,) with influence at each place."""
+        """Return for each sample (n,) the index of the first coefficient that influences it."""
         return self.columns[:, 0]
 
     def local(self, values: Array) -> Array:
-        """Select the entries (n, ..., SPLINE_SUPPORT) of values (n, ..., k) that belong to these
-        coefficients."""
+        """Select from values (n, ..., k) the entries (n, ..., SPLINE_SUPPORT) of the coefficients
+        that influence each sample."""
         shape = (len(self.columns), *[1] * (values.ndim - 2), SPLINE_SUPPORT)
         return np.take_along_axis(values, self.columns.reshape(shape), axis=-1)
 
     def duration(self, c: Array) -> float:
-        """Return the duration [s] by Simpson's rule: the places are uniform, an odd number of
-        them."""
+        """Return the duration [s] by Simpson's rule. The number of samples has to be odd."""
         return float(self._weights() @ (1.0 / np.sqrt(np.maximum(self.value @ c, 1e-300))))
 
     def _weights(self) -> Array:
@@ -378,7 +384,8 @@ class WarpedPath:
         return weights / (3.0 * (len(self.s) - 1))
 
     def time(self, c: Array) -> Array:
-        """Return times (n,) [s]; at rest, the path takes a second."""
+        """Return the times (n,) of the samples [s]; s itself if all coefficients are zero
+        (rest)."""
         v = self.value @ c
         if not v.any():
             return self.s
@@ -387,34 +394,37 @@ class WarpedPath:
         return np.concatenate([[0.0], np.cumsum(steps)])
 
     def speed(self, c: Array) -> Array:
-        """Return u' (n,) [1/s]."""
+        """Return the path speeds u' (n,) [1/s]."""
         return np.sqrt(np.maximum(self.squared_by @ c, 0.0))
 
     def acceleration(self, c: Array) -> Array:
-        """Return u'' (n,) [1/s^2]."""
+        """Return the path accelerations u'' (n,) [1/s^2]."""
         return np.asarray(self.acceleration_by @ c)
 
     def jerk(self, c: Array) -> tuple[Array, Array]:
-        """Return jerks (n, joints) and (n, 3) of the joints and the box frame [rad/s^3, m/s^3]."""
+        """Return the jerks of the joints (n, joints) [rad/s^3] and of the box frame (n, 3)
+        [m/s^3]."""
         root = np.sqrt(np.maximum(self.value @ c, 0.0))[:, None]
         own = c[self.columns][:, None]
         return root * (self.joint_jerk_by * own).sum(-1), root * (self.box_jerk_by * own).sum(-1)
 
     def objective(self, c: Array) -> tuple[Array, Array]:
-        """Return gradient and Hessian of the duration."""
+        """Return the gradient (k,) and the Hessian (k, k) of the duration by the coefficients."""
         v, weights = self.value @ c, self._weights()
         gradient = -0.5 * self.value.T @ (weights * v**-1.5)
         return gradient, 0.75 * (self.value.T * (weights * v**-2.5)) @ self.value
 
 
 class JerkProgram:
-    """Linear rows b - A c >= 0, and second-order cones of four such rows, few of which are active.
+    """Quadratic program with linear rows b - A c >= 0 and second-order cones of four such rows
+    each.
 
-    A row depends on few neighbouring coefficients: its A has those alone, from column `first` on.
+    Few rows are active at a solution. Each row depends on few neighbouring coefficients, so only
+    these entries of A are stored, beginning at column `first`.
     """
 
     def __init__(self, k: int) -> None:
-        """Start a program of k coefficients without rows."""
+        """Start a program with k coefficients and no rows."""
         from scipy import sparse
 
         self._k = k
@@ -422,13 +432,15 @@ class JerkProgram:
         self._cones = [(sparse.csr_array((0, k)), np.zeros((0, 4)))]
 
     def add_upper_bounds(self, A: Array, b: Array, first: NDArray[np.intp]) -> None:
-        """Add A c <= b, (n, width) and (n,), columns from first (n,) on."""
+        """Add n rows A c <= b. A (n, width) holds the entries from column `first` (n,) on; b is
+        (n,)."""
         self._linear.append((self._sparse_rows(A, first), b))
 
     def add_two_sided_bounds(
         self, A: Array, head: Array | float, bound: Array, first: NDArray[np.intp]
     ) -> None:
-        """Add A c + head c and -A c + head c below bound, by (n, m, width), (n, 1, width), (n,)."""
+        """Add |A c| <= bound - head c for m rows at each of n points: A (n, m, width), head (n, 1,
+        width), bound (n,); entries from column `first` (n,) on."""
         _, m, width = A.shape
         for sign in (1.0, -1.0):
             each = (sign * A + head).reshape(-1, width)
@@ -437,8 +449,8 @@ class JerkProgram:
     def add_norm_bounds(
         self, A: Array, b: Array, head: Array, bound: Array, first: NDArray[np.intp]
     ) -> None:
-        """Add |A c + b| <= bound - head c, by (n, 3, width), (n, 3), (n, width), (n,), columns from
-        first (n,) on."""
+        """Add n cones |A c + b| <= bound - head c: A (n, 3, width), b (n, 3), head (n, width),
+        bound (n,); entries from column `first` (n,) on."""
         rows = np.concatenate([head[:, None], -A], axis=1).reshape(-1, A.shape[2])
         placed = self._sparse_rows(rows, np.repeat(first, 4))
         self._cones.append((placed, np.column_stack([bound, b])))
@@ -453,7 +465,7 @@ class JerkProgram:
 
     @cached_property
     def rows(self) -> tuple[sparse.csr_array, Array, sparse.csr_array, Array]:
-        """Return all rows: A and b of the linear ones and of the cones."""
+        """Return A and b of all linear rows, then A and b of all cones."""
         from scipy import sparse
 
         A, b = zip(*self._linear, strict=True)
@@ -462,15 +474,22 @@ class JerkProgram:
         return stacked, np.concatenate(b), cones, np.concatenate(cone_b)
 
     def used(self, c: Array, share: float) -> tuple[Mask, Mask]:
-        """Return the linear rows and the cones that c uses beyond a share."""
+        """Mark the linear rows and the cones of which c uses more than `share` of the bound."""
         A, b, cone_A, cone_b = self.rows
         inside = cone_b - (cone_A @ c).reshape(-1, 4)
         lengths = np.linalg.norm(inside[:, 1:], axis=1)
         return np.asarray(A @ c > share * b), np.asarray(lengths > share * inside[:, 0])
 
     def minimise(self, H: Array, g: Array, about: Array) -> Array | None:
-        """Minimise c^T H c / 2 + g.c; rows that an answer violates are added. None without an
-        answer."""
+        """Minimise c^T H c / 2 + g.c, and solve again with the violated rows added until no row is
+        violated.
+
+        Args:
+            about: coefficients (k,) near the solution; rows that they nearly use enter at once.
+
+        Returns:
+            Coefficients (k,), or None if the solver fails.
+        """
         rows, cones = self.used(about, NEAR_ACTIVE_SHARE)
         while True:
             c = self._solve_subset(H, g, about, rows, cones)
@@ -485,7 +504,8 @@ class JerkProgram:
     def _solve_subset(
         self, H: Array, g: Array, scale: Array, rows: Mask, cones: Mask
     ) -> Array | None:
-        """Minimise with some of the rows; variables are scaled to be around one."""
+        """Minimise subject to the marked rows and cones only; `scale` brings variables to about
+        one."""
         # Not imported at the top: only jerk limits need it.
         import clarabel
         from scipy import sparse
@@ -512,9 +532,10 @@ class JerkProgram:
 
 
 def _add_linearised(at: WarpedPath, c: Array, value: Array, by: Array, rows: JerkProgram) -> None:
-    """Add values (n, m) at c over their limits, with derivatives (n, m, k), below one.
+    """Add rows value + by (c_new - c) <= 1 for values (n, m) over their limits with derivatives
+    `by` (n, m, k).
 
-    An excess between iterations, where the last one had no row, may remain for one iteration.
+    A value above one at c gets a row that still allows this excess once.
     """
     bound = np.maximum(at.keep[:, None], value) - value + by @ c
     A = at.local(by)

@@ -1,4 +1,5 @@
-"""Limits along a path as functions of its timing, for methods that solve programs."""
+"""Limits along a path as functions of path acceleration and squared speed, for optimisation
+programs."""
 
 from __future__ import annotations
 
@@ -13,14 +14,14 @@ from symbolic.contact.registry import command_model
 from symbolic.limits import Limit, limits_of_block
 
 LINEARISED_ABOVE = 0.6
-"""Torques and shifts below this share of their limit enter no program."""
+"""Joint torques and pressure shifts below this share of their limits are left out of programs."""
 
 
 class PathLimits:
-    """Limits of a path at samples, as functions of (u'', u'^2) over the limits.
+    """Limits at n samples of a path, as functions of u'' and u'^2, each divided by its bound.
 
-    Speeds are in `squared_speed_limit`. Robust forces of pads without one squeeze
-    (`ContactModel.has_scalar_squeeze`) are among the ratios.
+    Limits on speeds are in `squared_speed_limit` instead. If a contact model has no scalar squeeze
+    (`ContactModel.has_scalar_squeeze`), its robust forces belong to `ratios`, else to `forces`.
 
     Attributes:
         motion: geometry of the path at the samples.
@@ -34,16 +35,16 @@ class PathLimits:
         self._grasped = limits.robust and not self._squeezed
 
     def joint_accelerations(self) -> tuple[Array, Array]:
-        """Return the joint accelerations (n, all joints) by u'' and by u'^2, over their limits,
-        which apply to both signs."""
+        """Return the derivatives (n, all joints) of the joint accelerations by u'' and by u'^2,
+        over the limits. The limits apply to both signs."""
         (limit,) = limits_of_block("acceleration")
         first, second = self._derivatives(limit)
         bound = self._bounds[limit.name]
         return first / bound, second / bound
 
     def accelerations(self) -> list[tuple[Array, Array, float]]:
-        """Return the payload's accelerations (n, 3) by u'' and by u'^2, and the limits on their
-        lengths."""
+        """Return for each limit on the payload's acceleration its derivatives (n, 3) by u'' and by
+        u'^2, and the bound on its length."""
         return [
             (first[:, :3], second[:, :3], float(self._bounds[limit.name]))
             for limit in limits_of_block("cone")
@@ -55,9 +56,15 @@ class PathLimits:
         return getattr(m, f"{name}_first"), getattr(m, f"{name}_second")
 
     def forces(self, a: Array, w: Array) -> list[tuple[Array, Array]]:
-        """Compute normal forces (n, 2) that are convex in (u'', u'^2), and their slopes (n, 2, 2),
-        at u'' = a and u'^2 = w (n,), over the limit: planned ones, and robust ones if these are
-        limited."""
+        """Compute normal forces that are convex in (u'', u'^2), over the force limit.
+
+        Args:
+            a, w: (n,) values of u'' [1/s^2] and u'^2 [1/s^2].
+
+        Returns:
+            Pairs of values (n, 2) and slopes (n, 2, 2) by (u'', u'^2): planned forces, then robust
+            forces if these are limited. Empty without force limit.
+        """
         model, limit = self._model, self._limits.force
         if limit is None:
             return []
@@ -68,7 +75,8 @@ class PathLimits:
         return [(force / limit, slope / limit) for force, slope in found]
 
     def ratios(self, a: Array, w: Array) -> Array:
-        """Compute limits that are not convex, signed (n, k)."""
+        """Compute the quantities that are not convex in (u'', u'^2), over their limits and with
+        sign (n, k), at u'' = a (n,) and u'^2 = w (n,)."""
         m, workcell, limits = self.motion, self._model.workcell, self._limits
         pressure = limits.pressure and self._model.carry_limits.has_pressure_limit
         force = limits.force if self._grasped else None
@@ -89,7 +97,7 @@ class PathLimits:
         return np.concatenate(columns, axis=1)
 
     def ratio_slopes(self, ratios: Array, a: Array, w: Array) -> Array:
-        """Compute the slopes (n, k, 2) of `ratios` at a and w by (u'', u'^2), by forward
+        """Compute the slopes (n, k, 2) of `ratios` by (u'', u'^2) at a and w by forward
         differences."""
         step_a = 1e-5 * max(float(np.abs(a).max()), 1e-6)
         step_w = 1e-5 * max(float(w.max()), 1e-6)
@@ -102,7 +110,8 @@ class PathLimits:
 
 
 def squared_speed_limit(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> Array:
-    """Return the largest u'^2 (n,) by all limits on speeds; infinite where nothing moves."""
+    """Return the largest u'^2 (n,) [1/s^2] that all limits on speeds allow; infinite where nothing
+    moves."""
     task, bounds = model.workcell.task, model.carry_limits.bounds
     demands = []
     for limit in limits_of_block("speed"):
@@ -123,7 +132,8 @@ def squared_speed_limit(model: TimingModel, motion: PathMotion, limits: TimingLi
 
 
 def duration_at_speed_limits(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> float:
-    """Return the duration [s] of a path driven at its speed limits alone, without ramps."""
+    """Return the duration [s] of a path that is driven at its speed limits throughout,
+    accelerations unlimited."""
     squared = squared_speed_limit(model, motion, limits)
     slowness = 1.0 / np.sqrt(np.minimum(squared, 1e8))
     return float(np.trapezoid(slowness, motion.parameter))

@@ -1,6 +1,5 @@
-"""What timings of one workcell's carries are computed from, made once: the limits of a carry, and
-compiled functions of the geometry of a path, at samples of its parameter and between them, and of
-its loads."""
+"""The timing model of one workcell: the limits of its carries, and compiled functions of the
+geometry and the loads of a path."""
 
 from __future__ import annotations
 
@@ -35,19 +34,19 @@ REFINEMENT = 10
 """Samples per piece at which a timing is recomputed."""
 
 _SPLINE_EVERY = 2
-"""Samples per knot of the interpolating splines."""
+"""Every so many samples of a path are knots of the interpolating splines."""
 
 EXACT_FORCE_ABOVE = 0.98
-"""Robust forces above this share of a limit are computed exactly."""
+"""Robust forces above this share of the force limit are computed exactly."""
 
 PEAK_SEARCH_STRIDE = 20
 """Stride of the samples in the search for the largest robust force."""
 
 ROBUST_BATCH = 2000
-"""Samples of a carry whose cases are in memory together."""
+"""Number of samples whose uncertain cases are held in memory together."""
 
 LEAST_NORMAL_FORCE = 1e-9
-"""A contact with less normal force carries nothing [N]."""
+"""A contact with a smaller normal force counts as carrying nothing [N]."""
 
 if TYPE_CHECKING:
     import casadi as ca
@@ -55,9 +54,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PathMotion:
-    """Geometry of the path of a decision vector x (n_var,) at samples of the path parameter.
+    """Geometry of the path of a decision vector x (n_var,) at n samples of the path parameter.
 
-    Joints of both arms are stacked. `symbolic.path_motion` describes the quantities.
+    Arrays have one row per sample; joints of both arms are stacked. The names are the outputs of
+    `symbolic.path_motion`; `_first` and `_second` are derivatives by the path parameter.
     """
 
     x: Array
@@ -83,7 +83,7 @@ class PathMotion:
     manipulability: Array
 
     def at(self, samples: NDArray[np.intp]) -> PathMotion:
-        """Return the given samples in the given order."""
+        """Return the geometry at the samples with these indices, in this order."""
         sampled = {f.name: getattr(self, f.name)[samples] for f in fields(self) if f.name != "x"}
         return PathMotion(self.x, **sampled)
 
@@ -98,16 +98,16 @@ class PathMotion:
         return PathMotion(self.x, u, **shaped)
 
     def third_derivatives(self, u: Array) -> tuple[Array, Array]:
-        """Return third derivatives by the parameter at u (n,): joints (n, joints), box position (n,
-        3)."""
+        """Return the third derivatives of the joints (n, joints) and of the box position (n, 3) by
+        the path parameter, at parameters u (n,)."""
         joints = self.q_second.shape[1]
         both = self._third(u)
         return both[:, :joints], both[:, joints : joints + 3]
 
     @cached_property
     def _spline(self) -> tuple[CubicSpline, Array]:
-        """Return one spline through all stacked quantities, and the first column of each but the
-        first."""
+        """Return one spline through all quantities side by side, and the first column of each
+        quantity from the second on."""
         u = self.parameter[::_SPLINE_EVERY]
         columns = [
             getattr(self, name)[::_SPLINE_EVERY].reshape(len(u), -1) for name in SAMPLED_FIELDS
@@ -136,10 +136,10 @@ class CarryLimits:
     """The limits of a workcell's carries, recomputed from physical quantities alone.
 
     Attributes:
-        workcell: the cell.
-        bounds: by name of `symbolic.limits.LIMITS` the largest values, where the workcell states
-            them: (all joints,), (2,) of robots, or of the payload.
-        has_pressure_limit: whether its contact model limits the shift of the pressure.
+        workcell: the workcell.
+        bounds: largest allowed values, by name of a limit in `symbolic.limits.LIMITS` that the
+            workcell states: (all joints,) for joints, (2,) for robots, a number for the payload.
+        has_pressure_limit: whether the contact model limits the shift of the pressure.
     """
 
     def __init__(self, workcell: Workcell) -> None:
@@ -149,17 +149,18 @@ class CarryLimits:
         self._friction = np.array([contact.friction for contact in workcell.contacts])
 
     def applies(self, limit: Limit, limits: TimingLimits) -> bool:
-        """Return True if one of `LIMITS` applies."""
+        """Return True if the limit of the table `LIMITS` applies to timings within `limits`."""
         if limit.option == "pressure":
             return limits.pressure and self.has_pressure_limit
         return not limit.option or bool(getattr(limits, limit.option))
 
     def ratios(self, carry: Carry, limits: TimingLimits) -> dict[str, Array]:
-        """Compute every limited quantity over its limit at every sample.
+        """Compute every limited quantity over its limit at every sample of a carry.
 
         Returns:
-            By name of `symbolic.limits.LIMITS`, and friction: (n, all joints) for joints, (n, 2)
-            for robots, (n, 1) for the payload; only the limits that apply.
+            Ratios by name: friction, and each limit of `symbolic.limits.LIMITS` that applies.
+            Arrays are (n, all joints) for limits of joints, (n, 2) of robots, (n, 1) of the
+            payload.
         """
         bound = np.maximum(carry.normal_force * self._friction, LEAST_NORMAL_FORCE)
         ratios = {FRICTION_RATIO: carry.tangential_force / bound}
@@ -186,8 +187,8 @@ class CarryLimits:
         return ratios
 
     def limited_force(self, carry: Carry, limits: TimingLimits) -> Array:
-        """Return the limited normal forces (n, 2): planned, and robust ones where these are
-        limited."""
+        """Return the normal forces (n, 2) [N] that the force limit bounds: the planned ones; with a
+        robust limit the larger of planned and robust."""
         if not limits.robust:
             return carry.normal_force
         workcell = self.workcell
@@ -195,10 +196,10 @@ class CarryLimits:
         return np.maximum(carry.normal_force, np.stack([leading, commanded], axis=1))
 
     def _near_limit(self, carry: Carry, limits: TimingLimits) -> Array:
-        """Compute `limited_force`, exactly only where it matters.
+        """Compute `limited_force`, with exact robust forces only near the limit.
 
-        Robust forces below `EXACT_FORCE_ABOVE` of the limit and below the carry's largest are
-        replaced by the planned ones, which takes a fraction of the time.
+        Robust forces below both `EXACT_FORCE_ABOVE` of the limit and the carry's largest force are
+        replaced by the planned forces. This takes a fraction of the time.
         """
         if not limits.robust or limits.force is None:
             return self.limited_force(carry, limits)
@@ -226,8 +227,12 @@ def _bound_of(limit: Limit, workcell: Workcell) -> Array:
 def _robust_forces_above(
     level: float, points: PathPoints, path: RobustPath, found: Array, every: int = 1
 ) -> bool:
-    """Write the robust forces above a level [N], of every `every`-th point, into forces (n, 2);
-    return True if there are any."""
+    """Compute the robust forces above a level [N] at every `every`-th point, and raise the entries
+    of `found` (n, 2) [N] to them.
+
+    Returns:
+        True if there are any.
+    """
     known, rows = False, np.arange(0, len(points), every)
     for part in np.array_split(rows, -(-len(rows) // ROBUST_BATCH)):
         least = np.full(len(part), level)
@@ -247,16 +252,16 @@ def row_lengths(vectors: Array) -> Array:
 
 
 class TimingModel:
-    """Timing of one workcell's trajectories.
+    """Everything that timings of one workcell's trajectories are computed from.
 
     Attributes:
-        workcell: the cell.
-        compiled: the same with its compiled functions.
-        intervals: pieces of constant path acceleration.
+        workcell: the workcell.
+        compiled: the workcell with its compiled functions.
+        intervals: number of intervals of constant path acceleration.
         is_robust: whether force limits apply to every case of the workcell's uncertainty.
         passes: the compiled timing at these intervals.
-        carry_limits: the limits of the cell's carries.
-        joint_names: names of both arms' joints.
+        carry_limits: the limits of the workcell's carries.
+        joint_names: names of the joints of each arm.
     """
 
     def __init__(
@@ -268,7 +273,8 @@ class TimingModel:
         """Load or build the compiled functions.
 
         Args:
-            cell: compiled, if others share its functions.
+            cell: the workcell; give a compiled one to share its functions.
+            intervals: number of intervals of constant path acceleration.
             robust: whether force limits apply to every case of the workcell's uncertainty.
 
         Raises:
@@ -292,12 +298,11 @@ class TimingModel:
         self._functions = compiled.functions("timing", make, str(samples), bodies=False)
 
     def path_motion(self, x: Array) -> PathMotion:
-        """Compute the geometry at `REFINEMENT` samples per interval, uniform in u; the last one is
-        cached.
+        """Compute the geometry of a path at `REFINEMENT` samples per interval, uniform in u. The
+        last result is cached.
 
         Args:
-            x: (n_var,) decision vector, or the (n_path,) free waypoints alone, which then get the
-                highest force limit: it moves nothing.
+            x: (n_var,) decision vector, or only its free waypoints (n_path,).
 
         Raises:
             SettingsError: x has the wrong shape or is not finite.
@@ -319,8 +324,8 @@ class TimingModel:
         return self._latest
 
     def path_coefficients(self, motion: PathMotion) -> dict[str, Array]:
-        """Return the passes' input for one path: the coefficients of its limits, and its poses, at
-        both ends and in the middle of every interval."""
+        """Return the input of the compiled passes for one path: the coefficients of its limits and
+        its poses, at both ends and in the middle of every interval."""
         task, some = self.workcell.task, slice(None, None, REFINEMENT // 2)
         box = (motion.pose, motion.pose_first, motion.pose_second)
         joints = (motion.q, motion.q_first, motion.q_second)
@@ -337,12 +342,16 @@ class TimingModel:
         return {"limits": rows[None]} | poses
 
     def load(self, pose: Array, rate: Array, second_rate: Array) -> dict[str, Array]:
-        """Compute `symbolic.contact.load.LOAD_OUTPUTS` for n samples (n, 6) of the box motion."""
+        """Compute the loads of a box motion: the outputs `symbolic.contact.load.LOAD_OUTPUTS`.
+
+        Args:
+            pose, rate, second_rate: (n, 6) box pose and its first and second derivative by time.
+        """
         return self._functions["load"].batch(pose, rate, second_rate)
 
     def path_force(self, motion: PathMotion, a: Array, w: Array) -> tuple[Array, Array]:
-        """Compute normal forces (n, 2) [N] under u'' = a and u'^2 = w (n,), and their slopes (n, 2,
-        2) by these."""
+        """Compute the planned normal forces (n, 2) [N] at u'' = a (n,) and u'^2 = w (n,), and their
+        slopes (n, 2, 2) by (u'', u'^2)."""
         path = (motion.pose, motion.pose_first, motion.pose_second)
         found = self._functions["path_force"].batch(*path, a, w)
         return found["normal_force"], found["slope"]
@@ -350,19 +359,23 @@ class TimingModel:
     def uncertain_load(
         self, carry: Carry, friction: Array, centre_of_mass: Array
     ) -> dict[str, Array]:
-        """Compute loads of a carry with other friction coefficients (2,) and centre of mass (3,)
-        [m]."""
+        """Compute the loads of a carry with changed friction coefficients (2,) and centre of mass
+        (3,) in the box frame [m]."""
         return self._functions["uncertain_load"].batch(
             carry.pose, carry.rate, carry.second_rate, friction, centre_of_mass
         )
 
     def arm_motion(self, arm: int, q: Array, pose: Array, first: Array) -> dict[str, Array]:
-        """Compute `symbolic.path_motion.ARM_OUTPUTS` of one arm (0 or 1) on a straight line.
+        """Compute the outputs `symbolic.path_motion.ARM_OUTPUTS` of one arm while the box moves
+        straight.
 
         Args:
-            q: (n, joints) that hold a box at the poses, redundant ones at rest [rad].
-            pose: (n, 6) of that box [m, rad].
-            first: (n, 6) its derivative by the path parameter; the second one is zero.
+            arm: 0 or 1.
+            q: (n, joints) joint positions that hold the box at the poses [rad]; redundant joints
+                rest.
+            pose: (n, 6) box poses [m, rad].
+            first: (n, 6) derivative of the poses by the path parameter; the second derivative is
+                zero.
         """
         still = np.zeros((len(q), self.workcell.task.extended_size))
         motion = [still.copy() for _ in (pose, first)]
@@ -371,16 +384,20 @@ class TimingModel:
         return self._functions[f"arm_{arm + 1}"].batch(np.ascontiguousarray(q), *motion, still)
 
     def wrench_torque(self, q: Array, pose: Array) -> Array:
-        """Compute the matrices (n, all joints, 6) from contact wrenches to joint torques, at joints
-        (n, all joints) and box poses (n, 6)."""
+        """Compute the matrices (n, all joints, 6) from contact wrenches to joint torques.
+
+        Args:
+            q: (n, all joints) joint positions [rad].
+            pose: (n, 6) box poses [m, rad].
+        """
         arms, still = joints_of(self.workcell, q), np.zeros_like(pose)
         found = [self.arm_motion(arm, own, pose, still) for arm, own in enumerate(arms)]
         matrices = [each["wrench_torque"].reshape(len(q), -1, 6) for each in found]
         return np.concatenate(matrices, axis=1)
 
     def drive(self, motion: PathMotion, speed: Array, acceleration: Array) -> dict[str, Array]:
-        """Compute loads of a path driven with u' and u'' (n,) per sample; see also
-        `contact_torque`."""
+        """Compute the loads of a path that is driven with u' (n,) and u'' (n,) at the samples of
+        `motion`. Joint torques are not among them; `contact_torque` computes these."""
         rate = motion.pose_first * speed[:, None]
         second = motion.pose_second * speed[:, None] ** 2 + (
             motion.pose_first * acceleration[:, None]
@@ -388,12 +405,13 @@ class TimingModel:
         return self.load(motion.pose, rate, second)
 
     def contact_torque(self, wrench_torque: Array, load: Mapping[str, Array]) -> Array:
-        """Compute `contact_torque` of the wrenches of a `load`."""
+        """Compute the joint torques (n, all joints) [N m] that exert the contact wrenches of
+        `load`."""
         wrenches = (load["wrench_1"], load["wrench_2"])
         return contact_torque(len(self.joint_names[0]), wrench_torque, wrenches)
 
     def carry(self, motion: PathMotion, time: Array, speed: Array, acceleration: Array) -> Carry:
-        """Return the carry with the given timing (n,) at the samples of `motion`."""
+        """Return the carry at the samples of `motion` with times, u' and u'' (n,) each."""
         load = self.drive(motion, speed, acceleration)
         v, w, a = speed[:, None], speed[:, None] ** 2, acceleration[:, None]
         own = motion.torque_by_acceleration * a + motion.torque_by_speed * w
@@ -430,15 +448,15 @@ class TimingModel:
         return self.carry(motion, zero, zero, zero)
 
     def drive_limits(self, force: float) -> TimingLimits:
-        """Return the limits of drivable carries with a force limit [N], on robust forces if the
-        model limits these."""
+        """Return the limits of drivable carries with a force limit [N]; it bounds robust forces if
+        the model is robust."""
         return TimingLimits(force=force, robust=self.is_robust)
 
     def checked(self, x: Array) -> Array:
         """Return a decision vector (n_var,) as an array.
 
         Raises:
-            SettingsError: it does not fit the workcell.
+            SettingsError: x does not fit the workcell.
         """
         x = np.ascontiguousarray(x, dtype=float)
         n_var = self.workcell.task.n_var
@@ -451,14 +469,14 @@ class TimingModel:
 
 @dataclass(frozen=True)
 class SpeedProfile:
-    """Path speeds with constant u'' on intervals, at `REFINEMENT` samples per interval, both ends
-    of every interval included.
+    """Path speeds with constant u'' on intervals, at `REFINEMENT` samples per interval. Both ends
+    of every interval are samples.
 
     Attributes:
-        index: (n,) of the samples among those of a path's motion.
+        index: (n,) index of each sample among the samples of a `PathMotion`.
         time: (n,) [s].
-        share: (n,) positions of the samples within their intervals.
-        a, w: (n,) u'' and u'^2.
+        share: (n,) position of each sample within its interval, in [0, 1].
+        a, w: (n,) path acceleration u'' [1/s^2] and squared path speed u'^2 [1/s^2].
     """
 
     index: NDArray[np.intp]
@@ -490,14 +508,14 @@ class SpeedProfile:
     def carry(
         self, model: TimingModel, motion: PathMotion, a: float = 0.0, w: float = 0.0
     ) -> Carry:
-        """Return the carry of a path at these speeds, with `a` added to u'' and `w` to u'^2
-        everywhere."""
+        """Return the carry of a path at these speeds. Optionally add `a` to every u'' and `w` to
+        every u'^2."""
         speed = np.sqrt(np.maximum(self.w + w, 0.0))
         return model.carry(motion.at(self.index), self.time, speed, self.a + a)
 
 
 def sample_limits_set(compiled: CompiledCell, lanes: int) -> NumericFunction:
-    """Load or build `symbolic.limit_coefficients.sample_limits_function`."""
+    """Load or build the compiled function `symbolic.limit_coefficients.sample_limits_function`."""
 
     def make(model: CellModel) -> dict[str, ca.Function]:
         # Not imported at the top: a warm start needs no CasADi.
@@ -509,18 +527,23 @@ def sample_limits_set(compiled: CompiledCell, lanes: int) -> NumericFunction:
 
 
 def require_intervals(intervals: int) -> None:
-    """Raise an error for a number of intervals out of range."""
+    """Check the number of intervals.
+
+    Raises:
+        SettingsError: the number is out of range.
+    """
     if not 10 <= intervals <= 2000:
         raise SettingsError(f"{intervals} intervals; allowed are 10 to 2000", code="intervals")
 
 
 def contact_torque(first: int, wrench_torque: Array, wrenches: Iterable[Array]) -> Array:
-    """Compute joint torques (n, all joints) that exert wrenches (n, 6) of either robot on the box
-    [N m].
+    """Compute the joint torques (n, all joints) [N m] with which the robots exert wrenches on the
+    box.
 
     Args:
-        first: number of the first arm's joints.
-        wrench_torque: (n, all joints, 6) from wrenches to torques, both arms stacked.
+        first: number of joints of the first arm.
+        wrench_torque: (n, all joints, 6) matrices from wrenches to torques, both arms stacked.
+        wrenches: (n, 6) wrench of each robot [N, N m].
     """
     parts = (wrench_torque[:, :first], wrench_torque[:, first:])
     each = zip(parts, wrenches, strict=True)

@@ -37,37 +37,37 @@ from symbolic.read.arms import arm_model
 from symbolic.records import Robot, Workcell
 
 CUTS_PER_SAMPLE = 24
-"""Supporting lines per sample; new ones replace the oldest."""
+"""Supporting lines per sample at most. New lines replace the oldest."""
 
 MAX_CUT_ITERATIONS = 20
-"""Runs of the passes with more lines."""
+"""How often the passes run again with more supporting lines."""
 
 CUT_TOLERANCE = 1e-4
-"""Accepted excess over the limit, as a share of it."""
+"""Accepted excess of a force over its limit, as a share of the limit."""
 
 CUT_ABOVE = 0.98
-"""Forces above this share of the limit have a tangent in advance."""
+"""A force above this share of its limit gets a tangent before it exceeds the limit."""
 
 REST_UTILISATION = 1.0 - 1e-6
 """Largest share of the limit at rest, as in the passes."""
 
 
 AtRest = tuple[Array, int]
-"""Excess at rest: largest robust forces (2,) of both robots there [N], and the sample of the larger
-one."""
+"""Excess of robust forces at rest: the largest force (2,) of each robot [N], and the sample of the
+larger one."""
 
 
 class ForwardBackwardPasses:
-    """The compiled passes of one workcell.
+    """The compiled passes of one workcell, which time batches of paths.
 
     Attributes:
-        workcell: the cell.
-        intervals: pieces of constant path acceleration.
-        joint_names: of both arms' joints.
+        workcell: the workcell.
+        intervals: number of intervals of constant path acceleration.
+        joint_names: names of the joints of each arm.
     """
 
     def __init__(self, compiled: CompiledCell, intervals: int, threads: int = 1) -> None:
-        """Load or build the passes; so many threads share a batch of paths.
+        """Load or build the passes. `threads` threads share a batch of paths.
 
         Raises:
             DualArmError: the code cannot be built.
@@ -80,16 +80,18 @@ class ForwardBackwardPasses:
         self._has_scalar_squeeze = command_model(self.workcell).has_scalar_squeeze
 
     def supports(self, limits: TimingLimits) -> bool:
-        """Return True if the passes impose these limits: robust forces need a scalar squeeze."""
+        """Return True if the passes can impose these limits. Robust forces need a contact model
+        with a scalar squeeze."""
         return self._has_scalar_squeeze or not limits.robust
 
     def time(self, paths: Mapping[str, Array], limits: Sequence[TimingLimits]) -> list[PathTiming]:
-        """Compute the fastest timings of paths, each within its own limits.
+        """Compute the fastest timing of each of n paths within its own limits.
 
         Args:
-            paths: by name: limits (n, 2 intervals + 1, `symbolic.limits.limit_layout`), and for
-                robust limits pose, pose_first, pose_second (n, 2 intervals + 1, 6 or more).
-            limits: (n,) that the passes support.
+            paths: coefficients by name: limits (n, 2 intervals + 1, columns of
+                `symbolic.limits.limit_layout`); if any limit is robust also pose, pose_first and
+                pose_second (n, 2 intervals + 1, 6 or more).
+            limits: n sets of limits that the passes support.
         """
         found: list[PathTiming | None] = [None] * len(limits)
         for robust in (False, True):
@@ -159,7 +161,7 @@ def _options(limits: TimingLimits) -> list[float]:
 
 
 class RobustCuttingPlanes:
-    """Timings of n paths within robust forces, by supporting lines that are added between passes.
+    """Fastest timings of n paths within robust force limits, by Kelley's cutting planes.
 
     Attributes:
         peak: (n, 2) largest robust forces of the last timing [N].
@@ -172,12 +174,13 @@ class RobustCuttingPlanes:
         paths: Mapping[str, Array],
         options: Array,
     ) -> None:
-        """Start without lines.
+        """Start without supporting lines.
 
         Args:
             passes: `forward_backward_passes` with `CUTS_PER_SAMPLE`.
-            paths: coefficients and poses; see `ForwardBackwardPasses.time`.
-            options: (n, 4) of the passes, finite force limits first.
+            forces: robust forces of the workcell's paths.
+            paths: coefficients and poses as `ForwardBackwardPasses.time` takes them.
+            options: (n, 4) options of the passes; the first column holds finite force limits [N].
         """
         n, samples = paths["pose"].shape[:2]
         self._passes, self._forces, self._options = passes, forces, options
@@ -195,7 +198,11 @@ class RobustCuttingPlanes:
         self._share = np.tile([0.0, 0.5, 1.0], self._intervals)
 
     def time(self, threads: int) -> tuple[dict[str, Array], list[AtRest | None]]:
-        """Return the passes' outputs, and for each path its excess at rest, else None."""
+        """Time all paths.
+
+        Returns:
+            Outputs of the passes by name, and for each path its excess at rest, else None.
+        """
         still = self._at_rest()
         out = self._passes.batch(self._rows, self._options, self._cuts, threads=threads)
         left = np.array([k for k, rest in enumerate(still) if rest is None], dtype=np.intp)
@@ -228,8 +235,15 @@ class RobustCuttingPlanes:
         return found
 
     def _cut(self, chosen: NDArray[np.intp], squared: Array) -> NDArray[np.bool_]:
-        """Add tangents where timings (m, intervals + 1) of the chosen paths are near their limits;
-        return which of them exceed theirs."""
+        """Add tangents where the timings of the chosen paths come near their force limits.
+
+        Args:
+            chosen: (m,) indices of paths.
+            squared: (m, intervals + 1) squared path speeds of their timings.
+
+        Returns:
+            (m,) True for paths whose robust forces exceed their limit.
+        """
         m, per = len(chosen), len(self._sample)
         if not m:
             return np.zeros(0, dtype=bool)
@@ -262,7 +276,13 @@ class RobustCuttingPlanes:
         force: Array,
         slope: Array,
     ) -> None:
-        """Add tangents of the larger force at points z (m, 2) of paths and samples `place`."""
+        """Add the tangent of the larger of two forces at points z (m, 2) = (u'', u'^2).
+
+        Args:
+            place: path and sample of each point, (m,) each.
+            force: (m, 2) [N].
+            slope: (m, 2, 2) by (u'', u'^2).
+        """
         larger, every = force.argmax(axis=1), np.arange(len(force))
         limit = self._limit[place[0]]
         gradient = slope[every, larger] / limit[:, None]
@@ -287,7 +307,7 @@ PASS_STATUSES = (
     TimingStatus.NOT_CONVERGED,
     TimingStatus.SOLVER_FAILED,
 )
-"""Statuses of the passes, by number."""
+"""Timing status by the number that the compiled passes return."""
 
 
 def forward_backward_passes(
@@ -301,14 +321,14 @@ def forward_backward_passes(
     cuts, 3): at every sample lines alpha u'' + beta u'^2 <= bound with positive bounds, infinite
     after the last line.
 
-    Outputs: status, index into `PASS_STATUSES`; interval of a failure; duration [s], infinite
-    without a timing; peak (2,) normal forces [N]; use (len(LIMIT_NAMES), 3): largest share of each
-    limit, path parameter and joint or contact there; squared (intervals + 1,) u'^2 at the grid
-    points; sweeps, iterations of both passes; slowed, factor on the speed. Without a timing, peak
-    and use are those at rest.
+    Outputs: status, an index into `PASS_STATUSES`; interval of a failure; duration [s], infinite if
+    there is no timing; peak (2,) normal forces [N]; use (len(LIMIT_NAMES), 3): largest share of
+    each limit, with the path parameter and the joint or contact there; squared (intervals + 1,):
+    u'^2 at the grid points; sweeps: iterations of both passes; slowed: factor on the speed. If
+    there is no timing, peak and use describe rest.
 
     Args:
-        cuts: lines per sample that the caller adds.
+        intervals: number of intervals of constant path acceleration.
     """
     details = (str(intervals), str(cuts), source_digest(__name__, "symbolic.limits"), _passes_c())
     key = compiled.key("path timing", *details, bodies=False)
@@ -372,5 +392,5 @@ def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, s
 
 
 def joint_names(robot: Robot) -> tuple[str, ...]:
-    """Return the joints of a robot in the order of q."""
+    """Return the names of a robot's joints in the order of q."""
     return tuple(arm_model(robot).names)[1:]

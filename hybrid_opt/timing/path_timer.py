@@ -1,9 +1,9 @@
-"""Fastest timings of many paths of one workcell, from waypoints, fast enough for a search, and of
-the candidates of drivable cells, with the violations of those without one.
+"""Fastest timings of many paths of one workcell, fast enough for a search; and timings of the
+candidates of drivable workcells, with a violation for each path that cannot be timed.
 
-A carry is not built: `hybrid_opt.timing.solve.drive_path` recomputes one for a timing. A candidate
-of a drivable cell is a path and a force limit; its timing is the fastest from rest to rest within
-this limit and all limits of robots, payload and contacts.
+No carry is built here; `hybrid_opt.timing.solve.drive_path` computes one from a timing. A candidate
+of a drivable workcell is a path and a force limit. Its timing is the fastest from rest to rest
+within this limit and all limits of robots, payload and contacts.
 """
 
 from __future__ import annotations
@@ -44,16 +44,16 @@ if TYPE_CHECKING:
     from symbolic.cell_model import CellModel
 
 PATH_INTERVALS = 100
-"""Pieces of constant path acceleration."""
+"""Number of intervals of constant path acceleration."""
 
 
 class PathTimer:
-    """Times paths of one workcell. For limits that the compiled passes do not support it calls
-    `time_path`, which is slow.
+    """Timer for the paths of one workcell. Limits that the compiled passes do not support are left
+    to `time_path`, which is slow.
 
     Attributes:
-        workcell: the cell.
-        intervals: pieces of constant path acceleration.
+        workcell: the workcell.
+        intervals: number of intervals of constant path acceleration.
         passes: the compiled passes.
     """
 
@@ -67,10 +67,11 @@ class PathTimer:
         """Load or build the compiled functions.
 
         Args:
-            cell: compiled, if others share its functions.
-            threads: threads that share a batch.
-            lanes: paths of a batch that run side by side; 0 for the machine's width. One lane
-                builds faster.
+            cell: the workcell; give a compiled one to share its functions.
+            intervals: number of intervals of constant path acceleration.
+            threads: number of threads that share a batch.
+            lanes: number of paths that one vector instruction evaluates side by side; 0 for the
+                machine's width. One lane builds faster.
 
         Raises:
             SettingsError: the number of intervals is out of range.
@@ -94,8 +95,16 @@ class PathTimer:
         self._model = None if has_all else TimingModel(compiled, intervals)
 
     def path_limits(self, x: Array) -> dict[str, Array]:
-        """Compute the outputs of `symbolic.limit_coefficients.path_function` and the coefficients
-        `limits` for waypoints (n, n_var), at both ends and in the middle of every interval."""
+        """Compute the geometry of paths and the coefficients of their limits, at both ends and in
+        the middle of every interval.
+
+        Args:
+            x: (n, n_var) free waypoints of n paths.
+
+        Returns:
+            Outputs of `symbolic.limit_coefficients.path_function` by name, and `limits` (n, 2
+            intervals + 1, columns of `symbolic.limits.limit_layout`).
+        """
         # One path is not worth a second thread.
         threads = self._threads if len(x) > 1 else 1
         paths = self._path.batch(np.ascontiguousarray(x, dtype=float), threads=threads)
@@ -109,7 +118,7 @@ class PathTimer:
 
         Args:
             x: (n_var,) free waypoints.
-            limits: in addition to the workcell's.
+            limits: limits in addition to the workcell's.
 
         Raises:
             SettingsError: x has the wrong shape or is not finite.
@@ -118,7 +127,12 @@ class PathTimer:
         return timing
 
     def path_errors(self, paths: dict[str, Array]) -> list[PathTiming | None]:
-        """Return an error for each path of `path_limits` without feasible timing, else None."""
+        """Return for each path the error that excludes any timing: no motion, an arm that loses the
+        path, joint limits, or manipulability; else None.
+
+        Args:
+            paths: result of `path_limits`.
+        """
         names = ("lost", "limit_margin", "manipulability")
         sides = [np.stack([paths[f"{name}_{arm}"] for arm in (1, 2)], axis=2) for name in names]
         found = [
@@ -137,10 +151,12 @@ class PathTimer:
         paths: dict[str, Array] | None = None,
         path_errors: Sequence[PathTiming | None] | None = None,
     ) -> list[PathTiming]:
-        """Compute the fastest timing of every path (n, n_var) within its own limits.
+        """Compute the fastest timing of each of n paths within its own limits.
 
         Args:
-            paths, path_errors: answers of `path_limits` and `path_errors`, if known.
+            x: (n, n_var) free waypoints.
+            limits: n sets of limits in addition to the workcell's.
+            paths, path_errors: results of `path_limits` and `path_errors`; computed if None.
 
         Raises:
             SettingsError: x has the wrong shape or is not finite.
@@ -168,7 +184,7 @@ class PathTimer:
 
 
 def _as_path_timing(model: TimingModel, x: Array, limits: TimingLimits) -> PathTiming:
-    """Return the answer of `time_path` for a path (n_path,) as a `PathTiming`."""
+    """Time a path (n_path,) by `time_path` and convert the result to a `PathTiming`."""
     timing = time_path(model, x, limits)
     force, robust, carry = np.full(2, np.nan), None, timing.carry
     if timing.status is TimingStatus.INFEASIBLE_AT_REST:
@@ -197,36 +213,36 @@ _AT_REST = {"normal force": FORCE_LIMIT, "joint torque": JOINT_TORQUE}
 
 
 class CandidateDriver:
-    """Times candidates of one drivable workcell.
+    """Timer for the candidates of one drivable workcell.
 
     Attributes:
-        timer: times their paths.
+        timer: times the paths of the candidates.
         robust: whether force limits apply to every case of the workcell's uncertainty.
     """
 
     def __init__(self, timer: PathTimer, threads: int = 1, robust: bool = False) -> None:
-        """Drive with a timer; so many threads share a batch of candidates."""
+        """Use a path timer. `threads` threads share a batch of candidates."""
         self._task = timer.workcell.task
         self._threads = threads
         self.timer, self.robust = timer, robust
         self._last: tuple[bytes, PathTiming, dict[str, Array]] | None = None
 
     def limits(self, force: float) -> TimingLimits:
-        """Return the limits of a candidate with a force limit [N]."""
+        """Return the timing limits of a candidate with this force limit [N]."""
         return TimingLimits(force=max(force, 1e-9), robust=self.robust)
 
     def outputs(self, candidate: NumericFunction, x: Array) -> dict[str, Array]:
-        """Compute every per-sample output of decision vectors (n, n_var) under their timings.
+        """Compute every per-sample output of n candidates under their timings.
 
         Args:
             candidate: compiled `symbolic.functions.candidate_function`.
-            x: decision vectors. A path without a timing stands still for one second.
+            x: (n, n_var) decision vectors. A path without a timing stands still for one second.
 
         Returns:
-            Its outputs; peak_force (n, 2), the largest normal forces [N]; drive_violation (n,
-            len(DRIVE_CONSTRAINTS)), and drive_position (n,), its path parameter, NaN without one.
-            With robust limits robust_force (n, 2) as well, the largest in every case of the
-            workcell's uncertainty.
+            Outputs of `candidate` by name; peak_force (n, 2), the largest normal forces [N];
+            drive_violation (n, len(DRIVE_CONSTRAINTS)); drive_position (n,), the path parameter of
+            a violation, NaN if there is none. With robust limits also robust_force (n, 2), the
+            largest normal forces over all cases of the workcell's uncertainty [N].
         """
         if len(x) == 1:
             timings = [self.time_candidate(x[0])[0]]
@@ -263,8 +279,8 @@ class CandidateDriver:
         return outputs | {"drive_violation": violation, "drive_position": position}
 
     def time_candidate(self, x: Array) -> tuple[PathTiming, dict[str, Array]]:
-        """Compute the timing of one decision vector (n_var,), and `path_limits` of its path. The
-        last result is cached: a polish needs it several times in a row."""
+        """Compute the timing of one decision vector (n_var,), and the `path_limits` of its path.
+        The last result is cached, because a polish asks for it several times in a row."""
         key = x.tobytes()
         if self._last is None or self._last[0] != key:
             path = np.ascontiguousarray(x[None, : self._task.n_path], dtype=float)
@@ -275,8 +291,8 @@ class CandidateDriver:
 
 
 def _speed_profile_at(timing: PathTiming, u: Array) -> tuple[Array, Array, Array]:
-    """Return time, u' and u'' at path parameters u; u'' is that of the interval that begins
-    there."""
+    """Return time, u' and u'' at path parameters u (n,), each (n,). At a grid point u'' belongs to
+    the interval that begins there."""
     if not np.isfinite(timing.duration):
         return u, np.zeros_like(u), np.zeros_like(u)
     squared = timing.grid_speed**2
@@ -294,7 +310,8 @@ def _speed_profile_at(timing: PathTiming, u: Array) -> tuple[Array, Array, Array
 
 
 def search_timing(model: TimingModel, x: Array) -> PathTiming:
-    """Compute how a search drives a drivable carry x (n_var,) within its own force limit.
+    """Compute the timing that a search gives a drivable carry x (n_var,) within its own force
+    limit.
 
     Raises:
         SettingsError: x does not fit the workcell.
@@ -303,7 +320,7 @@ def search_timing(model: TimingModel, x: Array) -> PathTiming:
 
 
 def search_carry(model: TimingModel, x: Array) -> Carry:
-    """Compute the carry x (n_var,) under the task's own time law; see `hybrid_opt.carry`.
+    """Compute the carry of x (n_var,) under the task's own time law.
 
     Raises:
         SettingsError: x does not fit the workcell.

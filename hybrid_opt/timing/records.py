@@ -16,7 +16,8 @@ from symbolic.limits import LIMITS
 from symbolic.records import Workcell
 
 FRICTION_RATIO = "friction"
-"""Ratio of a carry that limits no timing: the contact forces satisfy it."""
+"""Name of the friction ratio of a carry. It limits no timing, because the contact forces satisfy it
+by construction."""
 
 PER_JOINT = tuple(limit.name for limit in LIMITS if limit.scope == "joint")
 PER_ROBOT = (FRICTION_RATIO, *(limit.name for limit in LIMITS if limit.scope == "robot"))
@@ -38,14 +39,14 @@ class TimingStatus(StrEnum):
 
 @dataclass(frozen=True)
 class Place:
-    """Limit and position on the path of an event.
+    """The limit and the place on the path of a failure or of a largest utilisation.
 
     Attributes:
-        constraint: limit, as `hybrid_opt.timing.model.CarryLimits.ratios` names it, or condition
-            of the path itself.
+        constraint: name of the limit, as `hybrid_opt.timing.model.CarryLimits.ratios` names it, or
+            a condition of the path itself.
         robot: name of the robot, '' for a limit of the box.
-        joint: name of the joint, '' without one.
-        sample: index of the sample, on the reporting function's grid.
+        joint: name of the joint, '' if the limit has no joint.
+        sample: index of the sample on the grid of the function that reports it.
         parameter: path parameter u in [0, 1].
     """
 
@@ -68,7 +69,15 @@ def limit_place(
     sample: int,
     parameter: float,
 ) -> Place:
-    """Return the place of a limit's use, by the column of its `CarryLimits.ratios`."""
+    """Return the place at which a limit is used most.
+
+    Args:
+        joint_names: names of the joints of each arm.
+        constraint: name of the limit.
+        column: column of `CarryLimits.ratios` of this limit: a joint, a robot, or 0.
+        sample: index of the sample.
+        parameter: path parameter u in [0, 1].
+    """
     robot, joint = "", ""
     if constraint in PER_JOINT:
         arm = int(column >= len(joint_names[0]))
@@ -109,11 +118,12 @@ class TimingLimits:
 
 @dataclass(frozen=True)
 class JerkLimits:
-    """Largest jerks.
+    """Largest allowed jerks of joints and payload.
 
     Attributes:
-        joints: (all joints,) of both arms in order [rad/s^3], infinite without a limit.
-        payload: of the box frame [m/s^3], likewise.
+        joints: (all joints,) limits of both arms' joints in order [rad/s^3]; infinite if not
+            limited.
+        payload: limit of the box frame [m/s^3]; infinite if not limited.
     """
 
     joints: Array
@@ -130,7 +140,7 @@ class JerkLimits:
 
     @classmethod
     def from_workcell(cls, workcell: Workcell) -> JerkLimits | None:
-        """Return the limits in a workcell's file, None without any."""
+        """Return the jerk limits that a workcell states; None if it states none."""
         joints = [
             np.full(len(robot.torque_max), np.inf) if robot.jerk_max is None else robot.jerk_max
             for robot in workcell.robots
@@ -142,7 +152,7 @@ class JerkLimits:
 
 @dataclass(frozen=True)
 class Utilisation:
-    """Largest value of a limited quantity over its limit, and its place."""
+    """Largest ratio of a quantity to its limit, and the place where it occurs."""
 
     ratio: Figure
     place: Place
@@ -155,15 +165,16 @@ class Timing(Displayable):
     Attributes:
         status: the outcome.
         reason: one sentence for people.
-        place: of the failure, or of the most used limit.
-        carry: the carry under this timing, resampled; None without a timing.
-        use: largest value over its limit, by constraint, recomputed on `carry`.
-        grid_speed: (intervals + 1,) path speed u' at the grid points [1/s]; empty without a timing,
-            and if u'' is not constant between them.
-        iterations: of the timing method.
-        slowed: uniform factor on the path speed by which recomputed limits hold, 1 normally.
-        seconds: computing time.
-        limits: limits in addition to the workcell's.
+        place: place of the failure, or of the most used limit.
+        carry: the carry under this timing, resampled; None if there is no timing.
+        use: largest utilisation by name of the limit, recomputed on `carry`.
+        grid_speed: (intervals + 1,) path speed u' at the grid points [1/s]; empty if there is no
+            timing, or if u'' is not constant between grid points.
+        iterations: iterations of the timing method.
+        slowed: uniform factor on the path speed, below one if only this made the recomputed limits
+            hold.
+        seconds: computing time [s].
+        limits: the limits in addition to the workcell's.
     """
 
     status: TimingStatus
@@ -184,19 +195,19 @@ class Timing(Displayable):
 
     @property
     def driven(self) -> Carry:
-        """Return the carry of a timing that exists."""
+        """Return the carry under this timing, which has to exist."""
         assert self.carry is not None, self.reason
         return self.carry
 
     @property
     def duration(self) -> float:
-        """Return the duration [s], infinite without a timing."""
+        """Return the duration [s]; infinite if there is no timing."""
         return self.carry.duration if self.carry is not None else float("inf")
 
     @property
     def peak_force(self) -> float:
-        """Return the largest limited normal force [N], robust if robust forces are limited; NaN
-        without a timing."""
+        """Return the largest normal force that the limits bound [N]: the robust force if robust
+        forces are limited, else the planned one. NaN if there is no timing."""
         if self.carry is None:
             return float("nan")
         if self.limits.force is None:
@@ -205,16 +216,17 @@ class Timing(Displayable):
 
 
 AGREEMENT = 5e-3
-"""Largest difference of a confirmed timing from TOPP-RA's, as a share of the duration."""
+"""Largest difference between a timing and TOPP-RA's at which the timing is confirmed, as a share of
+the duration."""
 
 
 @dataclass(frozen=True)
 class Validation:
-    """Durations of one path within the same limits.
+    """Durations of one path by two methods within the same limits.
 
     Attributes:
-        duration: of a timing [s].
-        reference: by TOPP-RA [s], infinite if it finds none.
+        duration: duration of the timing [s].
+        reference: duration by TOPP-RA [s]; infinite if TOPP-RA finds no timing.
     """
 
     duration: Figure
@@ -222,25 +234,25 @@ class Validation:
 
     @property
     def ratio(self) -> float:
-        """Return the timing's duration over TOPP-RA's."""
+        """Return the duration of the timing over that of TOPP-RA."""
         return self.duration / self.reference
 
     @property
     def is_confirmed(self) -> bool:
-        """Return True if both agree within `AGREEMENT`."""
+        """Return True if both durations agree within `AGREEMENT`."""
         return abs(self.ratio - 1.0) <= AGREEMENT
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class JerkTiming:
-    """A timing within jerk limits, and their cost.
+    """A timing within jerk limits, and what the jerk limits cost.
 
     Attributes:
-        timing: within them.
+        timing: the timing within the jerk limits.
         limits: the jerk limits.
-        jerk_use: largest joint jerk and payload jerk over their limits.
+        jerk_use: largest joint jerk and largest payload jerk, each over its limit.
         without: duration of the fastest timing without jerk limits [s].
-        rounds: programs solved.
+        rounds: number of programs solved.
     """
 
     timing: Timing
@@ -251,7 +263,8 @@ class JerkTiming:
 
     @property
     def cost(self) -> float:
-        """Return the share of the duration that the jerk limits add."""
+        """Return the increase of the duration by the jerk limits, as a share of the duration
+        without them."""
         return self.timing.duration / self.without - 1.0
 
     def __repr__(self) -> str:
@@ -264,20 +277,22 @@ class JerkTiming:
 
 @dataclass(frozen=True)
 class PathTiming:
-    """Fastest timing of one path within limits, or its error.
+    """Fastest timing of one path within limits, or the error of the path.
 
     Attributes:
         status: the outcome.
-        place: of the failure, or of the most used limit.
-        duration: [s], infinite without a timing.
-        peak_force: (2,) largest normal forces [N]; at rest without a timing, NaN if the path itself
-            fails.
-        use: largest share of each limit by name, likewise; empty if the path itself fails.
-        grid_speed: (intervals + 1,) path speed u' at the grid points [1/s], zero without a timing.
+        place: place of the failure, or of the most used limit.
+        duration: [s], infinite if there is no timing.
+        peak_force: (2,) largest normal forces [N]. If there is no timing, the forces at rest; NaN
+            if the path itself fails.
+        use: largest share of each limit by name. If there is no timing, the shares at rest; empty
+            if the path itself fails.
+        grid_speed: (intervals + 1,) path speed u' at the grid points [1/s]; zero if there is no
+            timing.
         sweeps: iterations of both passes.
-        slowed: uniform factor on the path speed by which the limits hold, 1 normally.
-        robust_force: (2,) as peak_force, in every case of the workcell's uncertainty; None if not
-            limited.
+        slowed: uniform factor on the path speed, below one if only this made the limits hold.
+        robust_force: (2,) like `peak_force`, but over all cases of the workcell's uncertainty; None
+            if robust forces are not limited.
     """
 
     status: TimingStatus
@@ -297,13 +312,14 @@ class PathTiming:
 
     @property
     def limited_force(self) -> float:
-        """Return the largest limited normal force [N]; see `peak_force`."""
+        """Return the largest normal force that the limits bound [N]: robust if robust forces are
+        limited, else planned."""
         known = self.peak_force if self.robust_force is None else self.robust_force
         return float(known.max())
 
 
 def failed_timing(status: TimingStatus, place: Place, intervals: int) -> PathTiming:
-    """Return the answer for a path without a timing."""
+    """Return the `PathTiming` of a path that cannot be timed."""
     speed = np.zeros(intervals + 1)
     return PathTiming(status, place, float("inf"), np.full(2, np.nan), {}, speed)
 
@@ -312,26 +328,27 @@ def failed_timing(status: TimingStatus, place: Place, intervals: int) -> PathTim
 
 
 LEAST_MOTION = 1e-9
-"""A path along which box and joints move less does not move [m, rad]."""
+"""Box and joints count as standing still if they move less along the whole path [m, rad]."""
 
 ARM_CHECKS = (
     (TimingStatus.OFF_PATH, "reach", "loses the path"),
     (TimingStatus.JOINT_LIMITS, "joint position", "leaves its joint range"),
     (TimingStatus.NEAR_SINGULAR, "manipulability", "comes too near a singular posture"),
 )
-"""Errors of an arm along a path, in the order of reporting: the timing's status, its name in a
-`Place`, and the robot's failure, for people."""
+"""Errors of an arm along a path, in the order in which they are reported: timing status, name of
+the condition in a `Place`, and a phrase that says what the robot fails to do."""
 
 
 def arm_path_error(
     workcell: Workcell, pose: Array, lost: Array, limit_margin: Array, manipulability: Array
 ) -> Timing | None:
-    """Return the error of a path without feasible timing, with arm and place, else None.
+    """Return the error of a path on which nothing moves or an arm fails, with arm and place; else
+    None.
 
     Args:
         pose: (n, 6) box poses at uniform samples.
-        lost, limit_margin, manipulability: (n, 2) by sample and arm, as of
-            `symbolic.robot.arm.TRACK_OUTPUTS`.
+        lost, limit_margin, manipulability: (n, 2) outputs of `symbolic.robot.arm.TRACK_OUTPUTS` of
+            these names, by sample and arm.
     """
     if float(np.abs(pose - pose[0]).max()) < LEAST_MOTION:
         reason = "all poses of the path are the same: there is nothing to time"

@@ -39,18 +39,18 @@ SCAN_STEPS = 16
 
 MARGIN_BISECTIONS = 20
 LEAST_FRICTION_SHARE = 0.02
-"""Share of the nominal friction coefficient at the end of its scan."""
+"""The scan of friction ends at this share of the nominal coefficient."""
 
 
 @dataclass(frozen=True)
 class PayloadSensitivity:
-    """Forces against payload mass (paper Figure 12); they are proportional to it.
+    """Contact forces against payload mass, to which they are proportional (paper Figure 12).
 
     Attributes:
-        mass: the workcell's payload [kg].
+        mass: the workcell's payload mass [kg].
         resultant: (2,) largest |f_i| of each robot at that mass [N].
-        mass_by_resultant: (2,) payload at which each robot's |f_i| reaches its reference force
-            [kg]; the paper's definition.
+        mass_by_resultant: (2,) payload mass at which |f_i| of each robot reaches its reference
+            force [kg], as the paper defines it.
     """
 
     mass: float
@@ -59,11 +59,12 @@ class PayloadSensitivity:
 
     @property
     def payload_limit(self) -> float:
-        """Return the least payload at which a robot reaches its reference force with |f_i| [kg]."""
+        """Return the smallest payload mass [kg] at which |f_i| of a robot reaches its reference
+        force."""
         return float(self.mass_by_resultant.min())
 
     def force_at(self, masses: Array) -> Array:
-        """Return the largest |f_i| (n, 2) [N] at payload masses (n,) [kg]."""
+        """Return the largest |f_i| (n, 2) [N] of both robots at payload masses (n,) [kg]."""
         forces: Array = np.asarray(masses)[:, None] / self.mass * self.resultant
         return forces
 
@@ -74,10 +75,10 @@ class Margin:
 
     Attributes:
         quantity: name of the assumption.
-        unit: of the values, '' for a pure number.
+        unit: unit of the values, '' for a pure number.
         nominal: value in the workcell.
-        limit: last value at which the carry holds, within 1e-7 of the scanned range.
-        fails: failure beyond it, '' without one in the scanned range.
+        limit: last value at which no limit is exceeded, to 1e-7 of the scanned range.
+        fails: name of the limit exceeded beyond it, '' if none is exceeded in the scanned range.
     """
 
     quantity: str
@@ -88,7 +89,7 @@ class Margin:
 
 
 def payload_sensitivity(carry: Carry) -> PayloadSensitivity:
-    """Return forces against payload mass for an unchanged timing."""
+    """Return the forces of a carry against payload mass, at unchanged timing."""
     cell = carry.workcell
     limited = limited_force(cell, carry.peak_normal_force, carry.peak_resultant_force)
     return PayloadSensitivity(cell.payload.mass, limited, mass_at_reference(cell, limited))
@@ -97,10 +98,10 @@ def payload_sensitivity(carry: Carry) -> PayloadSensitivity:
 def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
     """Compute the largest errors of friction, centre of mass and patch size that a carry tolerates.
 
-    The forces are allocated anew for the changed values (the robots squeeze as hard as necessary).
-    The carry fails if a normal force exceeds its reference force, a centre of pressure leaves its
-    patch, or a joint torque exceeds its maximum. Motion and timing stay the same. Pads with uniform
-    pressure have a margin until a rim lifts off instead of one of the patch.
+    Motion and timing stay the same. For the changed values the forces are computed anew, so the
+    robots squeeze as hard as necessary. The carry fails if a normal force exceeds its reference
+    force, a centre of pressure leaves its patch, or a joint torque exceeds its maximum. A pad with
+    uniform pressure has no margin of its patch, but one until its rim lifts off.
     """
     workcell = model.workcell
     payload, contacts, task = workcell.payload, workcell.contacts, workcell.task
@@ -112,7 +113,7 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
     has_patches = model.carry_limits.has_pressure_limit
 
     def failure(friction: Array, centre: Array) -> str:
-        """Return the name of the most exceeded limit, or '' if all hold."""
+        """Return the name of the most exceeded limit; '' if no limit is exceeded."""
         load = model.uncertain_load(carry, friction, centre)
         torque = model.contact_torque(wrench_torque, load) + own_torque
         use = {
@@ -127,7 +128,8 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
         return "" if use[name] <= 1.0 else name
 
     def lowered(whose: str, which: Array) -> Margin:
-        """Lower the coefficients marked by `which` (2,) by the same share."""
+        """Return the margin of the friction coefficients marked by `which` (2,), lowered by the
+        same share."""
         nominal = float(friction[which > 0.0].min())
         lost, fails = _largest_feasible_change(
             lambda lost: failure(friction * (1.0 - lost * which), centre),
@@ -136,7 +138,8 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
         return Margin(f"friction of {whose}", "", nominal, nominal * (1.0 - lost), fails)
 
     def shifted(axis: int, sign: float) -> Margin:
-        """Shift the centre of mass along one box axis, up to the box's faces."""
+        """Return the margin of the centre of mass along one box axis, at most to the box's
+        faces."""
         nominal, direction = float(centre[axis]), sign * np.eye(3)[axis]
         offset, fails = _largest_feasible_change(
             lambda offset: failure(friction, centre + offset * direction),
@@ -161,8 +164,9 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
 
 
 def _even_margins(model: TimingModel, carry: Carry) -> list[Margin]:
-    """Return how far the pressure of each pad may still shift at its largest shift on the carry,
-    before an elastic pad lifts off at a rim; nominal without any shift."""
+    """Return for each elastic pad how far its centre of pressure may still shift before a rim lifts
+    off [m], measured at the largest shift of the carry. Without any shift this is the whole free
+    shift."""
     workcell = model.workcell
     if not contact_model(workcell).has_elastic_layers:
         return []
@@ -184,7 +188,7 @@ def _even_margins(model: TimingModel, carry: Carry) -> list[Margin]:
 
 
 def _largest_feasible_change(failure: Callable[[float], str], end: float) -> tuple[float, str]:
-    """Return the largest change in [0, end] without failure, and the failure beyond it.
+    """Return the largest change in [0, end] before the first failure, and the name of that failure.
 
     A scan brackets the first failure, so that a later recovery does not hide it.
     """
@@ -204,13 +208,13 @@ def _largest_feasible_change(failure: Callable[[float], str], end: float) -> tup
 
 
 LINEARISED_UTILISATION = 0.97
-"""Utilisation from which on a change of the timing may exceed a limit."""
+"""Limits used beyond this share enter the linear program."""
 
 TRUST_RADIUS = 0.02
 """Largest relative change of every squared speed in a nearby timing."""
 
 OPTIMALITY_GAP = 5e-3
-"""Relative reduction of the duration up to which a timing counts as the fastest."""
+"""A timing counts as the fastest if the linear program shortens it by less than this share."""
 
 EXTRAPOLATED_CHANGE, NEGLIGIBLE_CHANGE = 1e-4, 1e-10
 """Largest change of a ratio in a program, by scaling, and changes that count as zero [share of a
@@ -221,17 +225,17 @@ DIFFERENCE_STEP = 1e-6
 
 
 class TimingSensitivity:
-    """Linear program of timings near the fastest one of a path.
+    """Linear program of timings near the fastest timing of a path.
 
     Attributes:
-        speeds: of the fastest one.
+        speeds: path speeds of the fastest timing.
     """
 
     def __init__(self, model: TimingModel, timing: Timing) -> None:
         """Linearise the limits that a timing of `time_path` nearly uses.
 
         Raises:
-            SettingsError: there is no timing, or it is not the fastest.
+            SettingsError: there is no timing, or the timing is not the fastest.
         """
         if timing.carry is None or not len(timing.grid_speed):
             raise SettingsError(f"there is no timing: {timing.reason}")
@@ -270,13 +274,15 @@ class TimingSensitivity:
             )
 
     def changes(self, low: dict[str, Array], high: dict[str, Array]) -> tuple[float, float]:
-        """Compute the changes of the duration [s] towards two cells.
+        """Compute the changes of the shortest duration [s] if a parameter of the workcell changes.
 
         Args:
-            low, high: ratios at `speeds` of two cells at the same distance below and above.
+            low, high: ratios of all limits at `speeds`, for the workcell with the parameter lowered
+                and raised by the same amount.
 
         Returns:
-            Towards the higher and towards the lower cell; NaN without a timing nearby.
+            Change of the duration with the parameter raised, and with it lowered; NaN if no timing
+            nearby satisfies the limits.
         """
         more = (self._select_used(high) - self._select_used(low)) / 2.0
         largest = float(np.abs(more).max(initial=0.0))
@@ -294,7 +300,8 @@ class TimingSensitivity:
         return np.concatenate([ratios[name][places] for name, places in self._used.items()])
 
     def _least_change(self, left: Array) -> float:
-        """Return the least change of the duration [s] with slacks (m,) of the limits."""
+        """Return the smallest change of the duration [s] that the slacks (m,) of the limits
+        allow."""
         found = linprog(
             self._slope,
             A_ub=self._matrix,

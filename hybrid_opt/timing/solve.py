@@ -1,5 +1,5 @@
-"""The fastest timing of a path: one front for the methods that compute it, and the check of any
-timing against every limit, recomputed from physical quantities alone."""
+"""The fastest timing of a path by either method, and the check of any timing against every limit,
+recomputed from physical quantities alone."""
 
 from __future__ import annotations
 
@@ -29,13 +29,14 @@ from symbolic.errors import SettingsError
 from symbolic.functions import TIMING_TOLERANCE
 
 FRICTION_ROUNDING = 1e-6
-"""The least-effort forces are on the friction cones; an excess up to this is rounding."""
+"""Excess of the friction ratio that counts as rounding: least-effort forces are exactly on the
+friction cones."""
 
 RECOMPUTED_TOLERANCE = TIMING_TOLERANCE
 """Largest accepted excess of a recomputed limit, as a share of it."""
 
 LEAST_SPEED_FACTOR = 0.98
-"""A timing that has to be slowed further to satisfy its limits has not converged."""
+"""A timing that needs a smaller factor on its speeds to satisfy its limits has not converged."""
 
 FACTOR_TOLERANCE = 1e-4
 """Share of a limit that a factor on the speeds may leave unused."""
@@ -49,14 +50,14 @@ def time_path(
 ) -> Timing:
     """Compute the fastest timing from rest to rest within the workcell's and the given limits.
 
-    The compiled passes compute it; limits that they do not support take `topp_ra`, which is many
-    times slower. The timing is recomputed on the finer grid, and slowed down uniformly where a
-    limit is exceeded there.
+    The compiled passes compute it; limits that they do not support are left to `topp_ra`, which is
+    many times slower. The timing is checked on a finer grid, and slowed down uniformly if it
+    exceeds a limit there.
 
     Args:
-        x: (n_var,) decision vector, or its free waypoints (n_path,).
-        limits: None for the joint torques and the contact patches.
-        motion: the path's geometry, if known.
+        x: (n_var,) decision vector, or only its free waypoints (n_path,).
+        limits: limits in addition to the workcell's; None for joint torques and contact patches.
+        motion: geometry of the path; computed if None.
 
     Raises:
         SettingsError: x does not fit the workcell.
@@ -74,8 +75,8 @@ def time_path(
 def _error_at_rest(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> Timing | None:
     """Return an error if a limit is exceeded at rest, else None.
 
-    Without one a timing exists: slow enough, every quantity is arbitrarily close to its value at
-    rest.
+    If no limit is exceeded at rest a timing exists: in a slow motion every quantity is close to its
+    value at rest.
     """
     timing = check_limits(model, model.still(motion), limits)
     used = most_used(timing.use)
@@ -113,10 +114,10 @@ def _run_programs(
 
 
 def time_by_programs(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> Timing:
-    """Compute the fastest timing by TOPP-RA's linear programs; see `hybrid_opt.timing.topp_ra`.
+    """Compute the fastest timing of a path by TOPP-RA's linear programs, checked on the finer grid.
 
     Args:
-        motion: of a path that both arms follow and that can be held at rest.
+        motion: geometry of a path that both arms follow and on which no limit is exceeded at rest.
     """
     found = _run_programs(model, motion, limits)
     return found if isinstance(found, Timing) else _slow_down(model, motion, limits, found)
@@ -164,7 +165,7 @@ def _slow_down(
 
 
 def path_error(model: TimingModel, motion: PathMotion) -> Timing | None:
-    """Return the error of a path without feasible timing, else None."""
+    """Return the error of a path on which nothing moves or an arm fails, else None."""
     arms = motion.lost, motion.limit_margin, motion.manipulability
     return arm_path_error(model.workcell, motion.pose, *arms)
 
@@ -175,10 +176,15 @@ def check_limits(
     limits: TimingLimits,
     ratios: Mapping[str, Array] | None = None,
 ) -> Timing:
-    """Return a carry as a timing with status `OK`, with the utilisation of its limits.
+    """Compute the utilisation of every limit by a carry.
 
     Args:
-        ratios: those of `CarryLimits.ratios`, if known.
+        limits: limits in addition to the workcell's.
+        ratios: result of `CarryLimits.ratios`; computed if None.
+
+    Returns:
+        Timing with the carry and the utilisations. Its status is always `OK`; the caller judges the
+        utilisations.
     """
     ratios = model.carry_limits.ratios(carry, limits) if ratios is None else ratios
     use = dict[str, Utilisation]()
@@ -193,8 +199,9 @@ def check_limits(
 
 
 def joint_use(carry: Carry) -> dict[str, Array]:
-    """Return the largest utilisation of every joint's limits over the carry, (all joints,) per
-    joint constraint; `contact torque` is the share of the contact wrench alone."""
+    """Return the largest utilisation of every joint over the carry, (all joints,) by name of the
+    joint limit. The entry `contact torque` is the part of the torque that exerts the contact
+    wrench."""
     limits = CarryLimits(carry.workcell)
     ratios = limits.ratios(carry, TimingLimits())
     use = {name: ratios[name].max(axis=0) for name in PER_JOINT}
@@ -203,8 +210,13 @@ def joint_use(carry: Carry) -> dict[str, Array]:
 
 
 def largest_speed_factor(use: Callable[[float], float]) -> float:
-    """Return the largest factor on the speeds, at most one, without an exceeded limit, by a
-    function of the factor to the largest utilisation; one if none exceeds `RECOMPUTED_TOLERANCE`.
+    """Return the largest factor on the speeds, at most one, at which no limit is exceeded.
+
+    Args:
+        use: largest utilisation of any limit as a function of the factor.
+
+    Returns:
+        The factor; one if the full speed exceeds no limit by more than `RECOMPUTED_TOLERANCE`.
     """
     fast = use(1.0)
     if fast <= 1.0 + RECOMPUTED_TOLERANCE:
@@ -226,7 +238,8 @@ def largest_speed_factor(use: Callable[[float], float]) -> float:
 
 
 def most_used(use: dict[str, Utilisation]) -> Utilisation:
-    """Return the largest utilisation; friction, tight by construction, counts only if violated."""
+    """Return the largest utilisation. Friction, fully used by construction, counts only if it is
+    exceeded."""
     candidates = [
         excess
         for name, excess in use.items()
@@ -245,16 +258,17 @@ def drive_path(
     """Check a given timing of a path against every limit.
 
     Args:
-        model: its intervals are those of the timing.
+        model: timing model with as many intervals as the timing.
+        limits: limits in addition to the workcell's.
         x: (n_var,) decision vector.
         grid_speed: (intervals + 1,) path speed u' at the grid points [1/s].
-        motion: geometry of the path, if known.
+        motion: geometry of the path; computed if None.
 
     Returns:
-        Status `OK`, or `EXCEEDED` with the limit and the place; or the error of the path itself.
+        Timing with status `OK`; `EXCEEDED` with the limit and the place; or the error of the path.
 
     Raises:
-        SettingsError: x or the speeds do not fit.
+        SettingsError: x does not fit the workcell, or the speeds do not fit the intervals.
     """
     grid_speed = np.asarray(grid_speed, dtype=float)
     moves = np.all(grid_speed[:-1] + grid_speed[1:] > 0.0) if grid_speed.ndim == 1 else False

@@ -39,9 +39,9 @@ from symbolic.array import Array
 from symbolic.functions import TIMING_TOLERANCE
 
 MAX_ITERATIONS = 25
-"""Linear problems per timing at most."""
+"""Largest number of linear problems per timing."""
 SETTLED_CHANGE = 2e-4
-"""Relative change of the duration below which linearised limits count as settled."""
+"""Linearised limits count as settled if the duration changes by less than this share."""
 
 INTERVAL_ENDS = (0.0, 1.0)
 """Positions within an interval at which limits apply, as shares of its length."""
@@ -55,8 +55,11 @@ FORCE_SHARPNESS = 0.02
 
 @dataclass(frozen=True)
 class LinearLimits:
-    """Limits alpha u'' + beta u'^2 <= bound, each (n, k): at points of the path, or by interval, of
-    its constant u'' and the u'^2 at its beginning."""
+    """k linear limits alpha u'' + beta u'^2 <= bound at each of n places, arrays (n, k).
+
+    A place is a point of the path, or an interval. For an interval, u'' is its constant path
+    acceleration and u'^2 is taken at its beginning.
+    """
 
     alpha: Array
     beta: Array
@@ -69,20 +72,20 @@ def toppra_timing(
     """Compute the fastest timing by a sequence of TOPP-RA's linear programs.
 
     Args:
-        motion: of a path that both arms follow and that can be held at rest.
+        motion: geometry of a path that both arms follow and on which no limit is exceeded at rest.
 
     Returns:
-        The timing, not recomputed yet, or the solver's failure.
+        The timing, not yet checked on the finer grid, or the solver's failure.
     """
     return _CuttingPlaneProblem(model, motion, limits).solve()
 
 
 class _CuttingPlaneProblem:
-    """Linear problems for one path with one set of limits, from one timing to the next.
+    """The sequence of linear problems for one path and one set of limits.
 
-    `_tightened` (intervals,) divides an interval's bounds, above one if a limit is exceeded between
-    the points at which it applies; `_near` marks the limits that are not convex and came near their
-    bound.
+    `_tightened` (intervals,) divides the bounds of each interval; it is above one if a limit was
+    exceeded between the points of the interval. `_near` marks the limits that are not convex and
+    came near their bounds.
     """
 
     def __init__(self, model: TimingModel, motion: PathMotion, limits: TimingLimits) -> None:
@@ -103,8 +106,8 @@ class _CuttingPlaneProblem:
         self._duration = np.inf
 
     def _first_rows(self) -> Iterator[LinearLimits]:
-        """Return limits that are linear: on speeds, which bound u'^2 alone, and on joint
-        accelerations; and supporting lines of the convex ones before any timing is known."""
+        """Yield the linear limits, on speeds and on joint accelerations, and first supporting lines
+        of the convex limits, before any timing is known."""
         limit = squared_speed_limit(self._model, self._at.motion, self._limits)
         limit = np.minimum(limit, SPEED_CEILING / self._scale**2)[:, None]
         one, alpha, beta = np.ones_like(limit), *self._at.joint_accelerations()
@@ -123,7 +126,8 @@ class _CuttingPlaneProblem:
             yield tangent_rows(*force, _pairs(still, still))
 
     def solve(self) -> PathTiming | Timing:
-        """Solve linear problems until recomputed limits hold and the timing settles."""
+        """Solve linear problems until the recomputed limits are satisfied and the duration
+        settles."""
         squared = np.zeros(0)
         settled = False
         for iteration in range(1, MAX_ITERATIONS + 1):
@@ -146,7 +150,8 @@ class _CuttingPlaneProblem:
         )
 
     def _interval_rows(self, rows: list[LinearLimits]) -> LinearLimits:
-        """Express the rows of each interval's points by its u'' and its initial u'^2."""
+        """Express the rows at the points of each interval by u'' of the interval and u'^2 at its
+        beginning."""
         alpha, beta, bound = (
             np.concatenate([getattr(row, name) for row in rows], axis=1)
             for name in ("alpha", "beta", "bound")
@@ -163,14 +168,16 @@ class _CuttingPlaneProblem:
         )
 
     def _at_points(self, squared: Array) -> tuple[Array, Array]:
-        """Return u'' and u'^2 (points,) of a timing (intervals + 1,) in the scaled coordinate."""
+        """Return u'' and u'^2 (points,) of a timing, given as squared speeds (intervals + 1,) in
+        the scaled path coordinate."""
         slope = np.diff(squared)
         w = squared[:-1, None] + np.outer(slope, INTERVAL_ENDS)
         a = np.repeat(slope / (2.0 * np.diff(self._grid)), len(INTERVAL_ENDS))
         return a / self._scale, w.reshape(-1) / self._scale**2
 
     def _advance(self, squared: Array) -> bool:
-        """Add or renew rows about a timing; return True if it holds and has settled."""
+        """Add or renew rows about a timing. Return True if it satisfies the limits and has
+        settled."""
         a, w = self._at_points(squared)
         excess = self._cut(a, w)
         ratios = self._at.ratios(a, w)
@@ -192,7 +199,7 @@ class _CuttingPlaneProblem:
         return excess <= POINT_TOLERANCE and change <= SETTLED_CHANGE
 
     def _cut(self, a: Array, w: Array) -> float:
-        """Add supporting lines of the convex limits that a timing exceeds; return the largest
+        """Add supporting lines of the convex limits that a timing exceeds. Return the largest
         excess."""
         worst_excess = -1.0
         for first, second, limit in self._at.accelerations():
@@ -213,7 +220,7 @@ class _CuttingPlaneProblem:
         return worst_excess
 
     def _tighten(self, squared: Array) -> bool:
-        """Tighten the intervals that exceed a limit between their points; return True if there are
+        """Tighten the intervals that exceed a limit between their points. Return True if there are
         any."""
         ratios = self._model.carry_limits.ratios(self._refined(squared), self._limits)
         del ratios[FRICTION_RATIO]
@@ -246,36 +253,41 @@ class _CuttingPlaneProblem:
 
 
 def norm_rows(first: Array, second: Array, limit: float, directions: Array) -> LinearLimits:
-    """Return supporting lines of |first u'' + second u'^2| <= limit, by (n, 3) each, one per unit
-    vector of `directions` (n, k, 3)."""
+    """Return supporting lines of |first u'' + second u'^2| <= limit.
+
+    Args:
+        first, second: (n, 3).
+        directions: (n, k, 3) unit vectors; each gives one line.
+    """
     alpha = np.einsum("nkd,nd->nk", directions, first) / limit
     beta = np.einsum("nkd,nd->nk", directions, second) / limit
     return LinearLimits(alpha, beta, np.ones_like(alpha))
 
 
 def tangent_rows(value: Array, gradient: Array, z: Array) -> LinearLimits:
-    """Return supporting lines of convex values <= 1 that touch them at z.
+    """Return supporting lines of convex functions with limit one, tangent at z.
 
     Args:
-        value: (n, k) at z.
-        gradient: (n, k, 2) by (u'', u'^2).
-        z: (n, 2).
+        value: (n, k) values at z.
+        gradient: (n, k, 2) gradients at z by (u'', u'^2).
+        z: (n, 2) points (u'', u'^2).
     """
     bound = 1.0 - value + np.einsum("nkd,nd->nk", gradient, z)
     return LinearLimits(gradient[..., 0], gradient[..., 1], bound)
 
 
 def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> LinearLimits:
-    """Linearise value <= 1 about z such that rest stays feasible.
+    """Linearise functions with limit one about z such that rest stays feasible.
 
-    A linearisation that forbids rest follows the value by u'' and the chord to rest by u'^2: with a
-    raised bound instead, a row cuts off nothing, not even z.
+    A tangent that forbids rest is replaced: it keeps its slope by u'', and by u'^2 it takes the
+    chord from z to rest. Raising the bound of the tangent instead would cut off nothing, not even
+    z.
 
     Args:
-        value: (n, k) at z.
-        gradient: (n, k, 2) by (u'', u'^2).
-        at_rest: (n, k) at u'' = u'^2 = 0, below one.
-        z: (n, 2) point of linearisation.
+        value: (n, k) values at z.
+        gradient: (n, k, 2) gradients at z by (u'', u'^2).
+        at_rest: (n, k) values at u'' = u'^2 = 0, below one.
+        z: (n, 2) points (u'', u'^2).
     """
     lines = tangent_rows(value, gradient, z)
     least = (1.0 - at_rest) / 2.0
@@ -310,7 +322,7 @@ and now and then call a feasible interval infeasible."""
 
 @dataclass(frozen=True)
 class SolverFailure:
-    """A failure of toppra, and its interval."""
+    """A failure of toppra: the reason, and the index of the interval."""
 
     reason: str
     interval: int
@@ -320,7 +332,7 @@ def fastest_speed(rows: LinearLimits, grid: Array) -> Array | SolverFailure:
     """Compute the fastest motion from rest to rest within linear limits.
 
     Args:
-        rows: the limits.
+        rows: the linear limits by interval.
         grid: (intervals + 1,) increasing path coordinate, scaled so that speeds are around one.
 
     Returns:
@@ -342,7 +354,8 @@ def _solve(rows: LinearLimits, grid: Array) -> Array | SolverFailure:
     from toppra.interpolator import AbstractGeometricPath
 
     class Line(AbstractGeometricPath):  # type: ignore[misc]
-        """The path coordinate itself; the limits carry all geometry."""
+        """Geometric path for toppra that is the path coordinate itself. All geometry is in the
+        limits."""
 
         @property
         def dof(self) -> int:
@@ -356,7 +369,7 @@ def _solve(rows: LinearLimits, grid: Array) -> Array | SolverFailure:
             raise NotImplementedError
 
     class ToppraLimits(LinearConstraint):  # type: ignore[misc]
-        """All limits as rows F w <= g with w = (u'', u'^2)."""
+        """Constraint for toppra: rows F w <= g with w = (u'', u'^2)."""
 
         def compute_constraint_params(self, *_: Any) -> tuple[Any, ...]:
             n = len(grid)
@@ -393,7 +406,7 @@ def _solve(rows: LinearLimits, grid: Array) -> Array | SolverFailure:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence toppra's log; its failures become statuses."""
+    """Silence the log of toppra, whose failures are returned as `SolverFailure`."""
     logger = logging.getLogger("toppra")
     level = logger.level
     logger.setLevel(logging.CRITICAL + 1)
