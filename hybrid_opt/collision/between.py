@@ -1,12 +1,13 @@
-"""Collisions between samples: motion bounds, refinement where they exceed the clearance, proof.
+"""Collision check of motions between samples, by motion bounds and adaptive subdivision.
 
-A pair that is c_a and c_b apart at the two ends of an interval keeps a distance of at least
+A pair of bodies with clearances c_a and c_b at the two ends of an interval keeps a distance of at
+least
 
   (c_a + c_b - D) / 2 - K / 8       and of at least       max(c_a, c_b) - D - K / 8
 
-inside it, with D and K the chords and bends of both bodies
-(`symbolic.geometry.clearance`). Where neither exceeds the tolerance, the interval is halved;
-where the compiled clearance does not suffice, a measured distance takes its place.
+inside the interval, with D and K the chords and bends of both bodies
+(`symbolic.geometry.clearance`). If neither bound exceeds the tolerance, the interval is halved. If
+the compiled clearance is too small, a measured distance takes its place.
 """
 
 from __future__ import annotations
@@ -24,22 +25,24 @@ from symbolic.array import Array
 Status = Literal["free", "collision", "undecided"]
 
 HALVING_WINS = 0.06
-"""Share of the chord that a clearance must exceed for halving to be cheaper than measuring."""
+"""If the clearance exceeds the required one by this share of the chord, halving is cheaper than
+measuring."""
 
 DEPTH = 12
-"""Halvings of an interval after which it stays undecided."""
+"""Number of halvings after which an interval stays undecided."""
 
 HOPELESS_DEPTH = 3
-"""Halvings of an interval with an end too near for any proof: they only look for collisions."""
+"""After so many halvings an interval is given up if one of its ends is too near for any proof.
+Until then it is halved further, to look for collisions."""
 
 
 @dataclass(frozen=True)
 class MotionVerdict:
-    """What is known of the motion between samples.
+    """Result of the check of one motion between its samples.
 
     Attributes:
-        status: 'free' is proven; 'collision' was found by FCL; 'undecided' where a clearance is
-            too small for a proof, or to be told at the finest subdivision.
+        status: 'free' if proven; 'collision' if FCL found one; 'undecided' if a clearance is too
+            small for a proof.
         touch: the earliest collision, else the earliest undecided interval, else None.
     """
 
@@ -49,13 +52,13 @@ class MotionVerdict:
 
 @dataclass(frozen=True)
 class SampledMotions:
-    """Several motions on their samples, one after the other.
+    """Samples of several motions, one motion after the other.
 
     Attributes:
         configuration: (n, 6 + all joints) box poses [m, rad] and both arms' joint positions [rad].
         clearance: (n, n_pairs) lower bounds of the pairs' distances [m].
-        lengths: samples of each motion, at least two.
-        margin: (n_motions,) distance to be kept beyond the tolerance [m].
+        lengths: number of samples of each motion, at least two.
+        margin: (n_motions,) distance that bodies have to keep beyond the tolerance [m].
     """
 
     configuration: Array
@@ -65,18 +68,18 @@ class SampledMotions:
 
 
 def check_all_between(checker: CollisionChecker, sampled: SampledMotions) -> list[MotionVerdict]:
-    """Check motions between samples that are themselves free of collisions, moving linearly
-    between them."""
+    """Check motions between their samples, which must be free of collisions. Box pose and joints
+    move linearly between samples."""
     return _Sweep(checker, sampled).run()
 
 
 class _Sweep:
-    """All intervals of all motions, halved together.
+    """Adaptive subdivision of the intervals of all motions together.
 
     Attributes:
-        owner: (n_intervals,) motion that an interval belongs to.
-        first: (n_motions,) its first interval.
-        required: (n_motions, n_pairs) clearance to be kept [m].
+        owner: (n_intervals,) index of the motion of each interval.
+        first: (n_motions,) index of the first interval of each motion.
+        required: (n_motions, n_pairs) clearance that bodies have to keep [m].
     """
 
     def __init__(self, checker: CollisionChecker, sampled: SampledMotions) -> None:
@@ -119,7 +122,7 @@ class _Sweep:
     def _verdict(
         self, motion: int, hits: list[CollidingPair], left: list[CollidingPair]
     ) -> MotionVerdict:
-        """Return the verdict on one motion, its intervals counted from its own first sample."""
+        """Return the verdict on one motion. Its samples are counted from its own first sample."""
         kinds: tuple[tuple[Status, list[CollidingPair]], ...] = (
             ("collision", hits),
             ("undecided", left),
@@ -133,8 +136,11 @@ class _Sweep:
         return MotionVerdict("free", None)
 
     def _first_intervals(self) -> Intervals:
-        """Return the intervals between the samples that the motion bound does not clear, motion by
-        motion: nearly all are cleared, and arrays over all of them would not stay cached."""
+        """Return the intervals between samples that the motion bound does not clear.
+
+        Motions are handled one by one: nearly all intervals are cleared, and arrays over all of
+        them would not stay in the cache.
+        """
         found = []
         for motion, count in enumerate(self.sampled.lengths):
             first = int(self.first[motion]) + motion
@@ -164,7 +170,7 @@ class _Sweep:
         return Intervals(index, start, width, a, b, *self.checker.motion(*ends), pending)
 
     def _uncleared(self, work: Intervals) -> Intervals:
-        """Return the intervals with pairs that the motion bound does not clear."""
+        """Return the intervals in which the motion bound leaves a pair open."""
         c_a, c_b = work.a.clearance, work.b.clearance
         halfway = c_a + c_b
         halfway -= work.chord
@@ -178,16 +184,16 @@ class _Sweep:
         return replace(work, pending=pending)[left]
 
     def _required(self, work: Intervals) -> Array:
-        """Return the clearance to be kept in the intervals, (m, n_pairs), or (1, n_pairs) for
-        all [m]."""
+        """Return the clearance [m] that pairs have to keep in the intervals: (m, n_pairs), or (1,
+        n_pairs) if all intervals belong to one motion."""
         owners = self.owner[work.index]
         if len(owners) and owners[0] == owners[-1] and (owners == owners[0]).all():
             return self.required[owners[:1]]
         return self.required[owners]
 
     def _given_up(self, work: Intervals, level: int) -> NDArray[np.bool_]:
-        """Return (m,) True for intervals that stay undecided: those with an end from which no
-        shorter one could be proven either, at the last level all."""
+        """Return a mask (m,) of the intervals that stay undecided: at the last level all; before it
+        those with an end at which a pair is closer than required, so that no proof can succeed."""
         hopeless = np.full(len(work.index), level == DEPTH)
         if HOPELESS_DEPTH <= level < DEPTH:
             required = self.required[self.owner[work.index]]
@@ -199,9 +205,11 @@ class _Sweep:
         return hopeless
 
     def _measure(self, work: Intervals, end: End, last: bool) -> NDArray[np.intp]:
-        """Raise bounds to a proven distance where halving alone would take too long.
+        """Replace bounds at one end of the intervals by measured distances where halving would take
+        too long.
 
-        Returns (m,) the first colliding pair of each configuration, or -1.
+        Returns:
+            (m,) the first colliding pair at each end, or -1.
         """
         beyond = end.clearance - self._required(work)
         hopeless = ~(beyond > HALVING_WINS * work.chord)
@@ -210,7 +218,7 @@ class _Sweep:
         return self.checker.measure(*self.checker.split(end.configuration), end.clearance, wanted)
 
     def _halves(self, work: Intervals) -> Intervals:
-        """Return both halves of every interval, the earlier first."""
+        """Return both halves of every interval, the earlier half first."""
         middle = (work.a.configuration + work.b.configuration) / 2.0
         clearance = self.checker.bounds(*self.checker.split(middle))
         new = End(middle, clearance, np.zeros(clearance.shape, dtype=bool))
@@ -231,7 +239,7 @@ class _Sweep:
 
 
 class Rows:
-    """A record of arrays, and of such records, whose rows belong together."""
+    """A record of arrays with one row per item; its fields may be such records themselves."""
 
     def __getitem__(self, rows: NDArray[np.bool_]) -> Self:
         return of_rows(lambda values: values[0][rows], [self])
@@ -241,7 +249,7 @@ AnyRows = TypeVar("AnyRows", bound=Rows)
 
 
 def of_rows(made_of: Callable[[list[Any]], Any], records: Sequence[AnyRows]) -> AnyRows:
-    """Build a record like the given ones, each of its arrays made of theirs."""
+    """Combine records field by field, by a function from a list of arrays to one array."""
     parts = zip(*(vars(record).values() for record in records), strict=True)
     values = [
         of_rows(made_of, part) if isinstance(part[0], Rows) else made_of(list(part))
@@ -256,8 +264,8 @@ class End(Rows):
 
     Attributes:
         configuration: (m, 6 + all joints) pose, q_1, q_2.
-        clearance: (m, n_pairs), raised in place where FCL measured [m].
-        measured: (m, n_pairs) where it did.
+        clearance: (m, n_pairs) lower bounds of the distances [m]; measurements raise them in place.
+        measured: (m, n_pairs) True where a distance was measured.
     """
 
     configuration: Array
@@ -267,7 +275,7 @@ class End(Rows):
 
 @dataclass(frozen=True)
 class Intervals(Rows):
-    """Work list: intervals, both ends, and the pairs not yet cleared."""
+    """The intervals still to be checked: both ends, and the pairs that are still open."""
 
     index: NDArray[np.intp]
     start: Array
@@ -279,8 +287,8 @@ class Intervals(Rows):
     pending: NDArray[np.bool_]
 
     def hand_on(self) -> None:
-        """Copy what was measured at the end of an interval to the start of the next one, where both
-        are one place."""
+        """Copy measurements from the end of an interval to the start of the next one, if both are
+        the same configuration."""
         same = np.all(self.b.configuration[:-1] == self.a.configuration[1:], axis=1)
         before = np.flatnonzero(same)
         after = before + 1
@@ -290,5 +298,5 @@ class Intervals(Rows):
 
 
 def _alternating(values: list[Array]) -> Array:
-    """Interleave the rows of arrays."""
+    """Interleave the rows of several arrays."""
     return np.stack(values, axis=1).reshape(-1, *values[0].shape[1:])

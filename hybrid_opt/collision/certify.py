@@ -1,8 +1,9 @@
 """Continuous certification: the proof that a path is free of collisions throughout.
 
-`certify_all` proves it of any continuous paths. A search judges candidates on the task's samples;
-what it hands on (fronts, selected and polished trajectories) is certified along the continuous
-path: `configurations` finds any place of it by Newton's method, `certificates` are the proofs.
+`certify_all` proves this for any continuous paths. A search checks candidates on the task's samples
+only. The carries that it returns (fronts, selected and polished trajectories) are certified along
+the continuous path: `configurations` computes any place of the path by Newton's method,
+`certificates` gives the proofs.
 """
 
 from __future__ import annotations
@@ -31,23 +32,25 @@ from symbolic.records.task import place_redundant
 from symbolic.robot.arm import REACH_TOLERANCE
 
 Configuration = Callable[[Array], tuple[Array, Array, Array]]
-"""From path parameters (n,) to box poses (n, 6) and joint positions q_1, q_2."""
+"""Function from path parameters (n,) to box poses (n, 6) and joint positions q_1, q_2 (n,
+joints)."""
 
 Configurations = Callable[[NDArray[np.intp], Array], Array]
-"""From paths (n,) and a path parameter (n,) on each to configurations (n, 6 + all joints):
-box pose, q_1, q_2; NaN where an arm does not follow."""
+"""Function from indices of paths (n,) and path parameters (n,) to configurations (n, 6 + all
+joints): box pose, q_1, q_2. Rows are NaN where an arm loses the path."""
 
 STRAIGHTNESS = 1e-4
-"""How far two bodies together may be off straight motion between grid points [m]."""
+"""Largest accepted distance of two bodies together from straight motion between grid points [m]."""
 
 MOST_ROUNDS = 14
-"""Halvings of the grid after which a path counts as not smooth."""
+"""Number of halvings of the grid after which a path counts as not smooth."""
 
 CACHED_ROWS = 128
-"""Configurations whose pairs are looked at together."""
+"""Number of configurations whose pairs are computed together, so that they stay in the cache."""
 
 TOGETHER = 8
-"""Carries certified at once: enough to spare calls, few enough for their bounds to stay cached."""
+"""Number of carries certified together: enough to save calls, few enough for their bounds to stay
+in the cache."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -55,13 +58,14 @@ class Certificate:
     """The result of a certification.
 
     Attributes:
-        is_free: proven free of collisions, within the meaning of `certify`.
+        is_free: whether the path is proven free of collisions, under the assumption of
+            `certify_all`.
         at_sample: a collision at a grid point, or None.
         at_parameter: path parameter of the earliest collision or undecided place; NaN if free.
-        motion: the verdict between the grid points; None where a grid point collides.
-        grid_points: how many were used.
-        deviation: largest measured distance of a pair from straight motion between them [m].
-        lost: an arm does not follow the path, at `at_parameter`.
+        motion: the verdict between the grid points; None if a grid point collides.
+        grid_points: number of grid points.
+        deviation: largest measured distance of a pair from straight motion between grid points [m].
+        lost: whether an arm loses the path, at `at_parameter`.
     """
 
     is_free: bool
@@ -79,7 +83,7 @@ class Certificate:
 
     @property
     def problem(self) -> str:
-        """Why the path is refused, in words; '' where it is free."""
+        """The reason why the path is not certified, in words; '' if it is free."""
         if self.is_free:
             return ""
         if self.lost:
@@ -96,10 +100,11 @@ def certify(
     configuration: Configuration,
     parameters: Array,
 ) -> Certificate:
-    """Certify one path, see `certify_all`.
+    """Certify one path as `certify_all` does.
 
     Args:
-        parameters: (n,) increasing path parameters to start from.
+        configuration: gives the configuration at any path parameter.
+        parameters: (n,) increasing path parameters of the first grid.
 
     Raises:
         SettingsError: the path does not become straight on any grid.
@@ -118,14 +123,15 @@ def certify_all(
 ) -> list[Certificate]:
     """Prove that continuous paths are free of collisions, or find where they are not.
 
-    The grid of each is refined until no pair of bodies is, both together, farther than
-    `STRAIGHTNESS` from straight motion (linear in joints and box pose) in the middle of any
-    interval. The straight motion is then checked by adaptive subdivision with a margin of twice
-    that distance. So the proof holds for a path whose largest distance from straight motion in an
-    interval is at most twice the one in its middle, as for every path that is smooth on the grid.
+    The grid of each path is refined until, in the middle of every interval, each pair of bodies is
+    within `STRAIGHTNESS` of straight motion (linear in joints and box pose). Adaptive subdivision
+    then checks the straight motion with a margin of twice the largest such distance. The proof
+    holds for every path whose largest distance from straight motion in an interval is at most twice
+    the distance in the middle. A path that is smooth on the grid satisfies this.
 
     Args:
-        parameters: of every path (n,) increasing path parameters to start from.
+        configurations: gives the configuration of any path at any path parameter.
+        parameters: for every path (n,) increasing path parameters of the first grid.
 
     Raises:
         SettingsError: a path does not become straight on any grid.
@@ -151,11 +157,11 @@ def certify_all(
 
 @dataclass(frozen=True)
 class _Grid:
-    """Places on several paths, between which each is straight.
+    """Grid points of several paths, fine enough for straight motion between them.
 
     Attributes:
-        owner: (n,) path of each place, increasing.
-        u: (n,) its path parameter, increasing along each path.
+        owner: (n,) index of the path of each point, increasing.
+        u: (n,) path parameter of each point, increasing along each path.
         configuration: (n, 6 + all joints).
         deviation: (n_paths,) largest measured distance from straight motion [m].
     """
@@ -182,8 +188,8 @@ def _straight_grid(
     configurations: Configurations,
     parameters: Sequence[Array],
 ) -> _Grid:
-    """Refine the grids as `certify_all` describes. A path that is lost at a place is not refined
-    there."""
+    """Refine the grids as `certify_all` describes. Intervals are not refined at a place where an
+    arm loses the path."""
     owner = np.repeat(np.arange(len(parameters)), [len(u) for u in parameters])
     u = np.concatenate([np.asarray(grid, dtype=float) for grid in parameters])
     placed = configurations(owner, u)
@@ -218,8 +224,8 @@ def _straight_grid(
 
 
 def _farthest(checker: CollisionChecker, configuration: Array, other: Array) -> Array:
-    """Compute the largest chord (n,) of all pairs between two configurations (n, 6 + all joints)
-    [m], some rows at a time: the chords of all would not stay cached."""
+    """Compute for each row (n,) the largest chord [m] of any pair between two configurations (n, 6
+    + all joints). Few rows are computed at a time, so that they stay in the cache."""
     off = np.empty(len(configuration))
     for start in range(0, len(off), CACHED_ROWS):
         some = slice(start, start + CACHED_ROWS)
@@ -231,7 +237,8 @@ def _farthest(checker: CollisionChecker, configuration: Array, other: Array) -> 
 def _failed_on_grid(
     checker: CollisionChecker, grid: _Grid, path: int, clearance: Array
 ) -> Certificate | None:
-    """Return the certificate of a path that is lost or collides at a grid point, else None."""
+    """Return the certificate of a path that an arm loses or that collides at a grid point, else
+    None."""
     # In order of their owners: a slice, of which nothing is copied.
     rows = slice(*np.searchsorted(grid.owner, [path, path + 1]).tolist())
     u, placed = grid.u[rows], grid.configuration[rows]
@@ -260,11 +267,12 @@ class LostPathError(DualArmError):
 
 @dataclass(frozen=True)
 class SampledPath:
-    """A carry on its samples, from which Newton's method reaches any other place.
+    """The path of a carry on its samples, from which Newton's method reaches any other place.
 
     Attributes:
-        task: whose path it is.
-        waypoints: (n_waypoints, 6 + m) of the box and the redundant joints, angles unwrapped.
+        task: the task of the carry.
+        waypoints: (n_waypoints, 6 + m) waypoints of the box and of m redundant joints, angles
+            unwrapped.
         q_1, q_2: (n, joints) joint positions on samples uniform in the path parameter [rad].
     """
 
@@ -277,16 +285,17 @@ class SampledPath:
 def configurations(
     paths: Sequence[SampledPath], posture: NumericFunction, owner: NDArray[np.intp], u: Array
 ) -> Array:
-    """Compute configurations (n, 6 + all joints), box pose and both arms' joints, between the
-    samples.
-
-    Joint positions are NaN where Newton's method does not reach a place from the samples around.
+    """Compute configurations at any places of paths, between their samples.
 
     Args:
-        paths: of one task.
+        paths: sampled paths of one task.
         posture: compiled `symbolic.robot.arm.posture_function`.
         owner: (n,) index of the path of each place.
-        u: (n,) its path parameter.
+        u: (n,) path parameter of each place.
+
+    Returns:
+        (n, 6 + all joints) box pose and joints of both arms. Joints are NaN where Newton's method
+        does not reach the place from the neighbouring samples.
     """
     basis = path_position(len(paths[0].waypoints), u)
     waypoints = np.array([path.waypoints for path in paths])
@@ -311,7 +320,7 @@ def configurations(
 def certificates(
     checker: CollisionChecker, posture: NumericFunction, paths: Sequence[SampledPath]
 ) -> list[Certificate]:
-    """Certify carries of one task that are free on their samples."""
+    """Certify carries of one task whose samples are free of collisions."""
     found: list[Certificate] = []
     for first in range(0, len(paths), TOGETHER):
         some = paths[first : first + TOGETHER]

@@ -1,8 +1,9 @@
-"""The collision verdict on a candidate: compiled bounds, proofs, and FCL where they leave it open.
+"""The collision verdict on a candidate: compiled bounds and proofs first, FCL for pairs that these
+leave open.
 
-One rule on both sides of the tolerance: bodies collide if FCL finds an intersection, or if their
-distance is at most the tolerance. Bounds and proofs only decide what is farther from that than
-FCL's own resolution, so near contact FCL alone decides, screened or not.
+The rule is the same with or without bounds: bodies collide if FCL finds an intersection, or if
+their distance is at most the tolerance. Bounds and proofs decide only pairs that are farther from
+this border than FCL's resolution. Near contact FCL alone decides.
 """
 
 from __future__ import annotations
@@ -24,12 +25,12 @@ from symbolic.records import PAYLOAD_NAME
 
 @dataclass(frozen=True)
 class CollidingPair:
-    """Two colliding bodies, or two bodies too near for a proof that they do not collide.
+    """Two bodies that collide, or that are too near for a proof that they do not.
 
     Attributes:
-        sample: index of the sample, or of the sample before.
+        sample: index of the sample, or of the sample before the place.
         first, second: names of the bodies.
-        fraction: position between the sample and the next, 0 to 1.
+        fraction: position of the place between this sample and the next, 0 to 1.
     """
 
     sample: int
@@ -46,7 +47,7 @@ class Verdict:
     """The collisions of one candidate.
 
     Attributes:
-        colliding: (n,) samples in collision.
+        colliding: (n,) True for samples in collision.
         first_touch: the earliest collision, or None.
     """
 
@@ -60,27 +61,26 @@ class Verdict:
 
 
 RESTING_TOLERANCE = 1e-3
-"""How deep the payload may sink into a body that it is allowed to rest on [m]."""
+"""Depth to which the payload may penetrate a body that it may rest on [m]."""
 
 PROOF_MARGIN = 5 * FCL_RESOLUTION
-"""How clearly two shapes must be apart or intersect to be decided without FCL [m]."""
+"""Distance, or depth of intersection, from which a pair is decided without FCL [m]."""
 
 MEASURED_TOGETHER = 64
-"""Pairs that `CollisionChecker.min_distance` measures before it compares with the next bound."""
+"""Number of pairs that `CollisionChecker.min_distance` measures in one step."""
 
 
 class CollisionChecker:
-    """Checks the candidates of one workcell. Not to be shared between threads.
+    """Collision checker for the candidates of one workcell. Threads must not share one.
 
     Attributes:
-        geometry: the cell's bodies and pairs.
-        distances: of the same bodies.
-        judge: FCL's objects.
-        functions: those of `symbolic.geometry.clearance.screening_functions`, compiled or
-            interpreted.
-        free_beyond: (n_pairs,) bounds above these call a pair free [m].
-        resting_places: per allowed contact and fixed pose that touches: pair, box centre (3,),
-            departure [m].
+        geometry: the workcell's bodies and pairs.
+        distances: distance queries of these bodies.
+        judge: FCL objects of these bodies.
+        functions: `symbolic.geometry.clearance.screening_functions`, compiled or interpreted.
+        free_beyond: (n_pairs,) a pair is free if its lower bound exceeds this distance [m].
+        resting_places: for each allowed contact and each fixed pose that touches the body: index of
+            the pair, box centre (3,) [m], and departure [m].
     """
 
     def __init__(self, geometry: CellGeometry, functions: Mapping[str, NumericFunction]) -> None:
@@ -102,7 +102,7 @@ class CollisionChecker:
         return first, second, third
 
     def bounds(self, pose: Array, q_1: Array, q_2: Array) -> Array:
-        """Bound the distance of every active pair from below, (n, n_pairs) [m].
+        """Compute a lower bound (n, n_pairs) [m] of the distance of every active pair.
 
         Args:
             pose: (n, 6) box poses [m, rad].
@@ -119,16 +119,16 @@ class CollisionChecker:
 
     @cached_property
     def tables(self) -> tuple[JointTable, ...]:
-        """Tabulated bounds of active pairs."""
+        """Tables of lower bounds of active pairs over joint positions."""
         return joint_tables(self.geometry)
 
     def check(self, pose: Array, q_1: Array, q_2: Array, clearance: Array | None = None) -> Verdict:
-        """Check n samples.
+        """Check n samples for collisions.
 
         Args:
             pose: (n, 6) box poses [m, rad].
             q_1, q_2: (n, joints) joint positions [rad].
-            clearance: (n, n_pairs) bounds if known already, else they are computed.
+            clearance: (n, n_pairs) lower bounds of distances [m]; computed if None.
         """
         if clearance is None:
             clearance = self.bounds(pose, q_1, q_2)
@@ -156,14 +156,16 @@ class CollisionChecker:
         rows: NDArray[np.intp],
         pairs: NDArray[np.intp],
     ) -> NDArray[np.bool_]:
-        """Decide for single pairs of n samples whether they collide.
+        """Decide for m chosen pairs whether they collide.
 
         Args:
-            rows: (m,) the sample of each query, increasing.
-            pairs: (m,) its pair.
+            pose: (n, 6) box poses [m, rad].
+            q_1, q_2: (n, joints) joint positions [rad].
+            rows: (m,) index of the sample of each query, increasing.
+            pairs: (m,) index of the pair of each query.
 
         Returns:
-            (m,)
+            (m,) True for pairs that collide.
         """
         samples, rows = np.unique(rows, return_inverse=True)
         pose = pose[samples]
@@ -171,10 +173,11 @@ class CollisionChecker:
         return self._decide(placed, rows, pairs, self._resting(pose, rows, pairs))
 
     def penetrates(self, pose: Array, pair: int) -> bool:
-        """Return True if the box at a pose (6,) penetrates a body of the environment deeper than a
-        resting box may.
+        """Return True if the box penetrates a body of the environment deeper than
+        `RESTING_TOLERANCE`.
 
         Args:
+            pose: (6,) box pose [m, rad].
             pair: index of the pair of payload and body.
         """
         placed = self._place(pose[None], *self._still())
@@ -184,8 +187,14 @@ class CollisionChecker:
     def motion(
         self, start: tuple[Array, Array, Array], end: tuple[Array, Array, Array]
     ) -> tuple[Array, Array]:
-        """Compute chord and bend (n, n_pairs) [m] of every pair between two configurations (pose,
-        q_1, q_2), see `symbolic.geometry.clearance`."""
+        """Compute chord and bend (n, n_pairs) [m] of every pair between two configurations.
+
+        The chord bounds the relative motion of a pair between both ends; the bend bounds its second
+        derivative and thereby the distance from straight motion (`symbolic.geometry.clearance`).
+
+        Args:
+            start, end: box pose (n, 6), q_1 and q_2 (n, joints).
+        """
         asked = [self.functions[f"{block}motion"] for block in self.geometry.asked]
         found = [function.batch(*start, *end) for function in asked]
         chord, bend = (
@@ -196,14 +205,20 @@ class CollisionChecker:
     def measure(
         self, pose: Array, q_1: Array, q_2: Array, clearance: Array, wanted: NDArray[np.bool_]
     ) -> NDArray[np.intp]:
-        """Raise the bounds (n, n_pairs) of wanted pairs, in place, to a proven distance [m].
+        """Raise lower bounds of wanted pairs, in place, to proven distances [m].
 
-        A bound that is higher already stays. For a payload that may rest on a body, the distance of
-        the payload smaller by the resting tolerance counts, and the pair's own tolerance beside it:
-        it may come nearer than that.
+        A bound that is higher already stays. If the payload may rest on a body, its shape shrunk by
+        the resting tolerance is measured, and the pair's tolerance is added to the distance.
+
+        Args:
+            pose: (n, 6) box poses [m, rad].
+            q_1, q_2: (n, joints) joint positions [rad].
+            clearance: (n, n_pairs) lower bounds [m], raised in place.
+            wanted: (n, n_pairs) True for the pairs to be measured.
 
         Returns:
-            (n,) the first wanted pair of each sample that collides, whose bound stays, or -1.
+            (n,) index of the first wanted pair of each sample that collides, or -1. The bound of a
+            colliding pair stays.
         """
         hits = np.full(len(pose), -1)
         rows, pairs = np.nonzero(wanted)
@@ -227,13 +242,16 @@ class CollisionChecker:
     def violates_clearance(
         self, configuration: Array, wanted: NDArray[np.bool_], required: Array
     ) -> NDArray[np.bool_]:
-        """Find wanted pairs of n configurations that nothing can prove to be farther apart than
-        required, because they are not.
+        """Find pairs that are closer than required, as an upper bound of their distance proves.
 
         Args:
             configuration: (n, 6 + all joints).
-            wanted, required: (n, n_pairs), distances in metres. Of a payload that may rest on a
-                body nothing is said.
+            wanted: (n, n_pairs) True for the pairs in question.
+            required: (n, n_pairs) distances [m].
+
+        Returns:
+            (n, n_pairs) True for pairs that are closer. False for a payload where it may rest on
+            the body.
         """
         found = np.zeros(wanted.shape, dtype=bool)
         rows, pairs = np.nonzero(wanted)
@@ -246,10 +264,15 @@ class CollisionChecker:
         return found
 
     def min_distance(self, pose: Array, q_1: Array, q_2: Array, clearance: Array) -> float:
-        """Find the least distance over all pairs and samples, 0 where bodies intersect [m].
+        """Find the least distance over all pairs and samples [m]; 0 if bodies intersect.
 
-        Pairs are measured in the order of their bounds (n, n_pairs), until none is lower than the
-        best distance.
+        Pairs are measured in the order of their lower bounds, until no bound is below the least
+        distance found.
+
+        Args:
+            pose: (n, 6) box poses [m, rad].
+            q_1, q_2: (n, joints) joint positions [rad].
+            clearance: (n, n_pairs) lower bounds [m].
         """
         placed = self._place(pose, q_1, q_2)
         order = np.argsort(clearance, axis=None, kind="stable")
@@ -263,14 +286,15 @@ class CollisionChecker:
         return max(best, 0.0)
 
     def _still(self) -> tuple[Array, Array]:
-        """Return joints of both arms for one sample of which only the box is used."""
+        """Return placeholder joints of both arms for one sample of which only the box matters."""
         first, second = (np.zeros((1, arm.joints)) for arm in self.geometry.arms)
         return first, second
 
     def _bodies(
         self, pairs: NDArray[np.intp], resting: NDArray[np.bool_]
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return both bodies of each pair (m,); the smaller payload where it rests."""
+        """Return the indices of both bodies of each pair (m,); the shrunk payload where `resting`
+        is True."""
         first, second = self._pairs[pairs].T
         return np.where(resting, self.distances.shrunk_payload, first), second
 
@@ -286,7 +310,7 @@ class CollisionChecker:
         pairs: NDArray[np.intp],
         resting: NDArray[np.bool_],
     ) -> NDArray[np.bool_]:
-        """Decide which pairs collide (m,): by proof, by FCL where there is none."""
+        """Decide which pairs (m,) collide, by proof, and by FCL where no proof succeeds."""
         first, second = self._bodies(pairs, resting)
         # A resting payload may come nearer than the tolerance; it only must not intersect.
         tolerance = np.where(resting, 0.0, self.geometry.tolerance[pairs])
@@ -306,7 +330,7 @@ class CollisionChecker:
     def _resting(
         self, pose: Array, rows: NDArray[np.intp], pairs: NDArray[np.intp]
     ) -> NDArray[np.bool_]:
-        """Find queries (m,) whose contact is allowed with the box where it is."""
+        """Return True for each query (m,) in which the box may rest on the body at its pose."""
         found = np.zeros(len(pairs), dtype=bool)
         for pair, place, departure in self.resting_places:
             near = np.linalg.norm(pose[:, :3] - place, axis=1) <= departure
@@ -314,7 +338,7 @@ class CollisionChecker:
         return found
 
     def _find_resting(self) -> list[tuple[int, Array, float]]:
-        """Find the entries of `resting_places`."""
+        """Compute the entries of `resting_places`."""
         task = self.geometry.workcell.task
         pairs = {names: k for k, names in enumerate(self._names)}
         found = []

@@ -31,10 +31,10 @@ from symbolic.records import PAYLOAD_NAME, Box, Capsule, Cylinder, Sphere
 from symbolic.robot.bridge import REMEDY, require_same_minor
 
 INTERSECTING, OPEN, APART = -1, 0, 1
-"""Verdicts of `BodyDistances.decide`."""
+"""Verdicts of `BodyDistances.decide`: proven to intersect, not proven, proven to be apart."""
 
 FCL_RESOLUTION = 1e-5
-"""What FCL resolves of an intersection [m]; ten times its tolerance."""
+"""Depth of intersection that FCL resolves [m]; ten times its tolerance."""
 
 
 @cache
@@ -42,7 +42,7 @@ def compiled_distances() -> Any:
     """Load the compiled module.
 
     Raises:
-        BridgeError: it is missing, cannot be loaded, or was compiled against another Coal.
+        BridgeError: the module is missing, cannot be loaded, or was compiled against another Coal.
     """
     try:
         found = import_module("hybrid_opt.collision._distances")
@@ -55,24 +55,25 @@ def compiled_distances() -> Any:
 
 
 class BodyDistances:
-    """Answer queries of pairs of bodies at many placements in one call.
+    """Distance queries of many pairs of bodies at many poses in one call.
 
-    Queries of one pair start from the direction of the query before: order them by samples. Safe to
-    share between threads.
+    A query of a pair starts from the direction of the pair's query before, so order queries by
+    samples. Threads may share one.
 
     Attributes:
-        bodies: those of the geometry, then the payload smaller by the resting tolerance.
-        first_piece: (n_bodies + 1,) of each body, the index of its first piece among all.
-        poses: (n_pieces,) of each piece, the index of its pose in the cell's `piece_poses`.
-        shrunk_payload: index of the smaller payload.
-        native: the compiled object; `address` is what C code passes to `decide_pair`.
+        bodies: bodies of the geometry, then the payload shrunk by the resting tolerance.
+        first_piece: (n_bodies + 1,) index of the first piece of each body among all pieces.
+        poses: (n_pieces,) index of each piece's pose in the cell's `piece_poses`.
+        shrunk_payload: index of the shrunk payload.
+        native: the compiled object; C code passes its `address` to `decide_pair`.
     """
 
     def __init__(self, geometry: CellGeometry, resting_tolerance: float) -> None:
         """Prepare the shapes.
 
         Args:
-            resting_tolerance: by how much the smaller payload is smaller on every side [m].
+            geometry: bodies of the workcell.
+            resting_tolerance: distance by which the shrunk payload is smaller on every side [m].
         """
         payload = geometry.index(PAYLOAD_NAME)
         smaller = tuple(shrunk(p, resting_tolerance) for p in geometry.bodies[payload].pieces)
@@ -95,16 +96,16 @@ class BodyDistances:
         first: NDArray[np.intp],
         second: NDArray[np.intp],
     ) -> tuple[Array, Array]:
-        """Bound the distances of m pairs of bodies.
+        """Compute lower and upper bounds of the distances of m pairs of bodies.
 
         Args:
             placed: outputs of the function `piece_poses` for n samples.
-            rows: (m,) the sample of each query.
-            first, second: (m,) both bodies.
+            rows: (m,) index of the sample of each query.
+            first, second: (m,) indices of both bodies.
 
         Returns:
-            lower, upper: (m,) [m]; negative where the bodies intersect, -inf and inf at a pose that
-            is not finite.
+            Lower and upper bounds (m,) [m]. Both are negative if the bodies intersect, and -inf and
+            inf at a pose that is not finite.
         """
         lower, upper = self.native.distances(*_poses(placed), rows, first, second)
         return lower, upper
@@ -118,16 +119,16 @@ class BodyDistances:
         apart: Array,
         overlap: Array,
     ) -> NDArray[np.int8]:
-        """Prove of m pairs that they are apart or intersect.
+        """Try to prove of m pairs that they are apart or that they intersect.
 
         Args:
-            placed, rows, first, second: see `bounds`.
-            apart: (m,) distance that `APART` proves to be exceeded [m].
-            overlap: (m,) depth that `INTERSECTING` proves to be exceeded [m]; where it is negative,
-                a distance that is not reached.
+            placed, rows, first, second: as in `bounds`.
+            apart: (m,) the proof of `APART` shows a distance above this [m].
+            overlap: (m,) the proof of `INTERSECTING` shows a depth above this [m]. A negative value
+                stands for a distance that the pair falls short of.
 
         Returns:
-            (m,) the verdicts; `OPEN` where neither is proven.
+            (m,) `APART`, `INTERSECTING`, or `OPEN` if neither is proven.
         """
         found: NDArray[np.int8] = self.native.decide(
             *_poses(placed), rows, first, second, apart, overlap
@@ -142,9 +143,10 @@ def _poses(placed: Mapping[str, Array]) -> tuple[Array, Array]:
 def shape_table(
     shapes: Sequence[ConvexShape],
 ) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], Array]:
-    """Return kinds (n,), sizes (n, 3), numbers of corners (n,), and the corners (m, 3) of hulls.
+    """Return kinds (n,), sizes (n, 3) [m], numbers of corners (n,), and the corners (m, 3) [m] of
+    hulls.
 
-    They are the first arguments of the compiled `Bodies`; sizes are those of `distances.cpp` [m].
+    The compiled `Bodies` takes these four arrays first; `distances.cpp` defines the sizes.
     """
     kinds, sizes = zip(*(_measures(shape) for shape in shapes), strict=True)
     corners = [s.vertices if isinstance(s, Hull) else np.zeros((0, 3)) for s in shapes]
@@ -153,7 +155,7 @@ def shape_table(
 
 
 def _measures(shape: ConvexShape) -> tuple[int, tuple[float, float, float]]:
-    """Return kind and size of a shape as `distances.cpp` numbers them."""
+    """Return the kind and the sizes [m] of a shape as `distances.cpp` numbers them."""
     match shape:
         case Box():
             x, y, z = (float(length) / 2.0 for length in shape.size)
@@ -172,27 +174,26 @@ def _measures(shape: ConvexShape) -> tuple[int, tuple[float, float, float]]:
 
 
 class Judge:
-    """FCL objects of every piece.
-
-    A resource: one per thread.
+    """FCL objects of every piece. Each thread needs its own.
 
     Attributes:
-        calls: FCL queries made so far.
+        calls: number of FCL queries so far.
     """
 
     def __init__(self, distances: BodyDistances) -> None:
-        """Prepare the objects of the same bodies."""
+        """Create FCL objects of the same bodies."""
         self.calls = 0
         self._request = fcl.CollisionRequest()
         self._objects = [[fcl_object(p) for p in body.pieces] for body in distances.bodies]
         self._poses = np.split(distances.poses, distances.first_piece[1:-1])
 
     def intersects(self, placed: Mapping[str, Array], sample: int, i: int, j: int) -> bool:
-        """Return True if FCL finds an intersection of bodies i and j.
+        """Return True if FCL finds that bodies i and j intersect.
 
         Args:
             placed: outputs of the function `piece_poses`.
-            sample: index of a sample of these.
+            sample: index of the sample in `placed`.
+            i, j: indices of the bodies.
         """
         first, second = (self._placed(placed, sample, body) for body in (i, j))
         self.calls += len(first) * len(second)
@@ -208,7 +209,7 @@ class Judge:
 
 
 def fcl_object(piece: Piece) -> fcl.CollisionObject:
-    """Convert a piece, at its pose in its body's frame."""
+    """Convert a piece to an FCL object at its pose in the frame of its body."""
     shape = piece.shape
     match shape:
         case Box():

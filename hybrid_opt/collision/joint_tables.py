@@ -1,9 +1,9 @@
-"""Tabulated distances of two links with two turning joints between them.
+"""Tabulated distances of two links of an arm with two turning joints between them.
 
-Their distance depends on the positions of these joints alone. A table bounds it from below in every
-cell of a grid over one turn of both: the distance at the cell's centre, less how far the later link
-can move within the cell. Pieces that are far from the joints' axes move farther than those near
-them, so each counts with its own distance from the axes.
+The distance depends on the positions of these two joints alone. A table covers one turn of both
+joints by a grid of cells. In each cell it holds a lower bound: the distance at the cell's centre,
+minus the largest distance by which the later link can move within the cell. Pieces far from the
+joint axes move farther, so each piece has its own reach.
 """
 
 from __future__ import annotations
@@ -26,37 +26,39 @@ from symbolic.records.content import CacheKey, digest_of_parts
 from symbolic.records.poses import rotation_from_vector
 
 CELLS = 256
-"""Cells of a table along each joint; a power of two."""
+"""Number of cells of a table along each joint; a power of two."""
 
 CELLS_PER_RADIAN = CELLS / (2.0 * np.pi)
 
 FIRST_CELLS = 16
-"""Cells along each joint that are tried first; those whose bound is loose are halved."""
+"""Number of cells along each joint of the first grid. Cells with a loose bound are halved."""
 
 TIGHT = 0.25
-"""Share of the distance at a cell's centre that its bound must reach."""
+"""A bound is loose if it is below this share of the distance at the cell's centre."""
 
 TABLE_ROUNDING = 1e-8
-"""Part of a cell by which a position may be attributed to the cell beside it, and how far rounded
-poses may displace a point [m]."""
+"""Margin for rounding: the part of a cell by which a position may fall into the neighbouring cell,
+and the displacement of a point by rounded poses [m]."""
 
 POSE_DIGITS = 9
-"""Decimals of the poses of what stands; it reaches less than a few metres."""
+"""Decimals to which the poses of the earlier link's pieces are rounded; they are within a few
+metres."""
 
 MOST_ANGLE = 1e6
-"""Positions beyond this are not looked up: their cell would be uncertain [rad]."""
+"""Joint positions beyond this are not looked up, because rounding makes their cell uncertain
+[rad]."""
 
 
 @dataclass(frozen=True)
 class JointTable:
-    """Lower bounds of the distance of one active pair.
+    """Table of lower bounds of the distance of one active pair.
 
     Attributes:
-        pair: its index among the active ones.
+        pair: index of the pair among the active pairs.
         robot: index of the arm.
         joint: index of the first of the two joints.
-        bounds: (CELLS, CELLS) by cells of the first and of the second joint [m]; -1 where the
-            joints' limits allow no position.
+        bounds: (CELLS, CELLS) bounds by cells of the first and of the second joint [m]; -1 in cells
+            that the joint limits exclude.
     """
 
     pair: int
@@ -65,7 +67,7 @@ class JointTable:
     bounds: NDArray[np.float32]
 
     def look_up(self, q: Array) -> Array:
-        """Return lower bounds (n,) at the arm's joint positions (n, joints) [m]; -inf where a
+        """Return lower bounds (n,) [m] at joint positions (n, joints) of the arm; -inf if a
         position is not finite or beyond `MOST_ANGLE`."""
         positions = q[:, self.joint : self.joint + 2]
         known = np.all(np.abs(positions) < MOST_ANGLE, axis=1)
@@ -75,10 +77,10 @@ class JointTable:
 
 
 def joint_tables(geometry: CellGeometry) -> tuple[JointTable, ...]:
-    """Tabulate the pairs that compiled bounds often leave open.
+    """Build tables for the pairs that compiled bounds often leave open.
 
-    They are links with hulls that have two turning joints between them, and are near each other in
-    many postures or stand below one another.
+    These are pairs of bodies with hulls and with two turning joints of one arm between them, if
+    they are close in many postures or if the earlier body carries the arm.
     """
     close, found = close_pairs(geometry), []
     for k, pair in enumerate(geometry.active):
@@ -98,9 +100,10 @@ def joint_tables(geometry: CellGeometry) -> tuple[JointTable, ...]:
 
 
 def _in_root(body: CollisionBody, arm: ArmGeometry) -> tuple[Piece, ...]:
-    """Return the pieces of a link in its own frame, of one that stands in the arm's root.
+    """Return the pieces of a link in the link's frame; of a body fixed to the world in the frame of
+    the arm's root.
 
-    Where an arm stands leaves these poses as they are, but for their last digits.
+    The place of the arm in the cell changes these poses only in their last digits.
     """
     if body.frame != WORLD:
         return body.pieces
@@ -145,7 +148,8 @@ def _tabulate(given: CacheKey) -> NDArray[np.float32]:
 def _are_within_limits(
     cells: NDArray[np.intp], width: float, arm: ArmGeometry, joint: int
 ) -> NDArray[np.bool_]:
-    """Find the cells (n, 2) that hold allowed positions, whole turns aside."""
+    """Return True for each cell (n, 2) that holds positions within the joint limits, up to whole
+    turns."""
     low, high = arm.lower[joint : joint + 2], arm.upper[joint : joint + 2]
     off = np.mod((cells + 0.5) * width - (low + high) / 2.0 + np.pi, 2.0 * np.pi) - np.pi
     return np.asarray(np.all(np.abs(off) <= (high - low + width) / 2.0, axis=1))
@@ -156,10 +160,11 @@ def _reach(piece: Piece, body: CollisionBody, arm: ArmGeometry) -> Array:
 
 
 class _PieceDistances:
-    """Distances of the pieces of a link from an earlier one, at positions of two joints.
+    """Distances between pieces of two links of an arm as functions of two joint positions.
 
     Attributes:
-        still, moving: pieces of both, the earlier in its joint's frame, or the arm's root.
+        still: pieces of the earlier link, in the frame of its joint or of the arm's root.
+        moving: pieces of the later link.
     """
 
     def __init__(
@@ -178,11 +183,13 @@ class _PieceDistances:
     def bounds(
         self, q: Array, rows: NDArray[np.intp], moving: NDArray[np.intp]
     ) -> tuple[Array, Array]:
-        """Bound the distances (m,) of moving pieces (m,) from below and above [m].
+        """Compute lower and upper bounds (m,) [m] of the distances of moving pieces from the
+        earlier link.
 
         Args:
             q: (n, 2) joint positions [rad].
-            rows: (m,) those of each query.
+            rows: (m,) index of the joint positions of each query.
+            moving: (m,) index of the moving piece of each query.
         """
         # Not imported at the top: SciPy takes long to start, and cells without meshes need none.
         from scipy.spatial.transform import Rotation

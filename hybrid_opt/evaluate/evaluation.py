@@ -1,9 +1,9 @@
 """Evaluation of candidates: compiled physics, collision verdict, objectives, feasibility.
 
-This is what every search calls. A candidate is a decision vector; it is judged on the task's
-samples. Infeasible candidates get the paper's penalty (Eq. 60), extended to every constraint:
-all objectives take the value 1 + (time in violation, summed over the constraints) / duration.
-The same evaluation also returns each constraint's violation for constraint domination.
+Every search calls this evaluation. A candidate is a decision vector, evaluated on the task's
+samples. Infeasible candidates get the paper's penalty (Eq. 60), extended to every constraint: all
+objectives take the value 1 + (time in violation, summed over the constraints) / duration. The
+evaluation also returns each constraint's violation for constraint domination.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ BETWEEN_SAMPLES = "between_samples"
 NOT_FINITE = "not_finite"
 
 REASONS = (*CONSTRAINTS, COLLISION, BETWEEN_SAMPLES, NOT_FINITE, *DRIVE_CONSTRAINTS)
-"""What can make a candidate infeasible; `Evaluations.reason` indexes it.
+"""Reasons for which a candidate is infeasible; `Evaluations.reason` is an index into them.
 
 between_samples: not proven free of collisions between the samples; only fronts are certified.
-not_finite: an objective is NaN or infinite (a solver or model failure, never a front member).
-The rest only in drivable cells, see `hybrid_opt.carry.DRIVE_CONSTRAINTS`.
+not_finite: an objective is NaN or infinite, because a solver or the model failed.
+`hybrid_opt.carry.DRIVE_CONSTRAINTS`: only in drivable cells.
 """
 
 FEASIBLE = -1
@@ -69,19 +69,19 @@ FEASIBLE = -1
 
 @dataclass(frozen=True, repr=False)
 class Evaluations:
-    """Evaluations of n candidates; every array has a leading axis over them.
+    """Evaluations of n candidates.
 
     Attributes:
         x: (n, n_var) decision vectors.
-        objectives: (n, m) values without penalty; only meaningful where feasible.
+        objectives: (n, m) values without penalty; meaningful only for feasible candidates.
         penalised: (n, m) objectives with the paper's penalty, always finite, for searches.
-        feasible: (n,).
+        feasible: (n,) True for feasible candidates.
         reason: (n,) index into `REASONS` of the constraint violated first along the path, or
             `FEASIBLE`.
-        position: (n,) path parameter in [0, 1] of the first violation; NaN where feasible.
-        violation: (n, len(REASONS)) violation of each constraint, 0 where satisfied; the unit
-            is the constraint's (`symbolic.functions.CONSTRAINTS`), time share for
-            collision, 1 for those that follow it.
+        position: (n,) path parameter in [0, 1] of the first violation; NaN if feasible.
+        violation: (n, len(REASONS)) violation of each constraint, 0 if satisfied. It has the unit
+            of the constraint (`symbolic.functions.CONSTRAINTS`); for collisions it is the share of
+            time, and it is 1 for the reasons after collision.
         violation_time: (n, len(REASONS)) time in violation over the duration.
     """
 
@@ -109,8 +109,8 @@ class Evaluations:
 
     @property
     def infeasible_by_reason(self) -> dict[str, int]:
-        """Number of infeasible candidates by the constraint violated first, the most frequent
-        first."""
+        """Number of infeasible candidates by the constraint that each violates first, largest
+        number first."""
         counts = {name: int(np.sum(self.reason == i)) for i, name in enumerate(REASONS)}
         found = sorted(counts.items(), key=lambda item: -item[1])
         return {name: count for name, count in found if count}
@@ -127,28 +127,28 @@ class Evaluations:
 
 
 def concatenated(parts: list[Evaluations]) -> Evaluations:
-    """Concatenate evaluations, at least one, in order."""
+    """Concatenate evaluations in order. At least one is needed."""
     return Evaluations(
         **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Evaluations)}
     )
 
 
 MOST_KNOWN = 4096
-"""Paths that are remembered; then it begins anew."""
+"""Number of paths whose certification is cached; beyond it the cache starts anew."""
 
 
 class CandidateEvaluator:
-    """Evaluates candidates of one workcell with a fixed selection of objectives.
+    """Evaluator for the candidates of one workcell, with a fixed selection of objectives.
 
     Attributes:
-        workcell: the cell.
-        compiled: where its functions come from.
+        workcell: the workcell.
+        compiled: the workcell with its compiled functions.
         objectives, objective_names: the minimised objectives, and their names.
-        functions: the cell's compiled functions by name.
-        checker: FCL's verdict on samples.
+        functions: the compiled functions by name.
+        checker: collision checker of the workcell.
         n_var, lower, upper: size and bounds of the decision vector.
-        driver: what drives candidates of drivable cells, None in others.
-        threads: threads that share a batch.
+        driver: timer of the candidates of a drivable cell, else None.
+        threads: number of threads that share a batch.
     """
 
     def __init__(
@@ -163,14 +163,16 @@ class CandidateEvaluator:
         """Load or build the compiled functions.
 
         Args:
-            objectives: what to minimise, by name or as one's own record.
-            functions: those of `symbolic.functions`, if not to be loaded or built here.
-            driver: in drivable cells, likewise.
-            compiled: where functions are taken from, if others share it.
+            workcell: the workcell.
+            objectives: objectives to be minimised, by name or as `Objective` records.
+            threads: number of threads that share a batch.
+            functions: compiled functions of `symbolic.functions` by name; loaded or built if None.
+            driver: timer of the candidates of a drivable cell; built if None.
+            compiled: the workcell with its compiled functions, to share them; created if None.
 
         Raises:
-            SettingsError: an objective is unknown or there twice.
-            DualArmError: the model cannot be built (see `symbolic.cell_model`, `codegen`).
+            SettingsError: an objective is unknown or given twice.
+            DualArmError: the model or its code cannot be built.
         """
         self.workcell = workcell
         self.compiled = CompiledCell(workcell) if compiled is None else compiled
@@ -197,7 +199,7 @@ class CandidateEvaluator:
 
     @cached_property
     def _kernel(self) -> Kernel | None:
-        """The evaluation in lanes, if the machine and the cell allow it."""
+        """The evaluation in lanes; None if the machine or the cell does not support it."""
         return load_kernel(self.compiled, self.checker, self.outputs) if self._in_lanes else None
 
     def _driver(self, threads: int) -> CandidateDriver | None:
@@ -210,8 +212,13 @@ class CandidateEvaluator:
         return CandidateDriver(timer, threads, force_kind(self.objectives).robust)
 
     def beginning_at(self, q_1: Array, q_2: Array) -> CandidateEvaluator:
-        """Return the evaluator with other start postures: joints (n,) of each arm that hold the box
-        at the start. Its `outputs` and `carry` use the cell's own branches.
+        """Return a copy of the evaluator with other start postures.
+
+        Only `evaluate` and `certified` use these postures; `outputs` and `carry` keep the cell's
+        own start branches.
+
+        Args:
+            q_1, q_2: (n,) joints of each arm that hold the box at the start [rad].
 
         Raises:
             SettingsError: candidates of this cell are not evaluated in lanes.
@@ -227,16 +234,17 @@ class CandidateEvaluator:
         return other
 
     def outputs(self, x: Array) -> dict[str, Array]:
-        """Compute every per-sample output for decision vectors (n, n_var), see
-        `symbolic.functions`; in drivable cells also those of
+        """Compute every per-sample output of `symbolic.functions.candidate_function` for decision
+        vectors x (n, n_var). In drivable cells the result has the additional outputs of
         `hybrid_opt.timing.path_timer.CandidateDriver.outputs`."""
         return self._outputs(self._checked(x))
 
     def evaluate(self, x: Array, with_collisions: bool = True) -> Evaluations:
-        """Evaluate decision vectors (n, n_var).
+        """Evaluate decision vectors.
 
         Args:
-            with_collisions: False leaves collisions out where the evaluation is in lanes.
+            x: (n, n_var).
+            with_collisions: False skips the collision check if the evaluation is in lanes.
 
         Raises:
             SettingsError: x has the wrong shape.
@@ -264,7 +272,8 @@ class CandidateEvaluator:
         return carry_from_outputs(self.workcell, self.functions, x[0], single, judgement)
 
     def certificate(self, x: Array) -> Certificate:
-        """Certify one decision vector (n_var,) between its samples.
+        """Certify that the carry of one decision vector x (n_var,) is free of collisions
+        throughout.
 
         Raises:
             LostPathError: an arm loses the path, on its samples or between them.
@@ -281,8 +290,8 @@ class CandidateEvaluator:
         return found
 
     def _paths(self, x: Array) -> list[SampledPath | None]:
-        """Return the paths of decision vectors (n, n_var) on their samples; None if an arm loses
-        the path."""
+        """Return the sampled paths of decision vectors x (n, n_var); None for a path that an arm
+        loses."""
         if self._kernel is None:
             outputs: Mapping[str, Array] = self.outputs(x)
         else:
@@ -298,10 +307,12 @@ class CandidateEvaluator:
         ]
 
     def certified(self, evaluations: Evaluations) -> Evaluations:
-        """Return the evaluations with their feasible front proven free between the samples.
+        """Return the evaluations with a feasible front that is proven free of collisions
+        throughout.
 
-        Members of the front that are not proven free become infeasible for the reason
-        `between_samples`; what only they dominated is certified in turn, until the front stands.
+        A member of the front without proof becomes infeasible for the reason `between_samples`.
+        Candidates that only such members dominated enter the front and are certified too, until
+        every member has a proof.
         """
         feasible, reason = evaluations.feasible.copy(), evaluations.reason.copy()
         position, violation = evaluations.position.copy(), evaluations.violation.copy()
@@ -327,8 +338,9 @@ class CandidateEvaluator:
         )
 
     def _failures_between_samples(self, x: Array) -> list[float | None]:
-        """Return, for each carry (n, n_var), the path parameter where it is not proven free, else
-        None. Paths are cached, since carries may differ in their force limits only."""
+        """Return for each carry x (n, n_var) the path parameter at which the proof fails, else
+        None. Results are cached by path, since several carries may differ only in their force
+        limit."""
         paths = np.ascontiguousarray(x[:, : self.workcell.task.n_path])
         keys = [path.tobytes() for path in paths]
         new = {key: row for row, key in enumerate(keys) if key not in self._proofs}
@@ -356,7 +368,9 @@ class CandidateEvaluator:
         """Compute objectives, feasibility and penalties.
 
         Args:
-            described: the per-sample outputs that the objectives need.
+            x: (n, n_var) decision vectors.
+            sampled: violations and collisions on the samples.
+            described: per-sample outputs that the objectives need.
         """
         values = np.column_stack(
             [objective.evaluate(described, self.workcell) for objective in self.objectives]
@@ -410,16 +424,16 @@ class CandidateEvaluator:
 
 
 def _failure(certificate: Certificate | None) -> float | None:
-    """Return the path parameter where a carry is not proven free, else None; the start if an arm
-    loses the path."""
+    """Return the path parameter at which a certificate fails: 0 if an arm loses the path. None if
+    the carry is proven free."""
     if certificate is not None and certificate.is_free:
         return None
     return 0.0 if certificate is None or certificate.lost else certificate.at_parameter
 
 
 def _needs(objectives: Sequence[Objective]) -> tuple[str, ...] | None:
-    """Return the kernel's outputs per sample that the objectives need; None if they need more than
-    it has."""
+    """Return the names of the kernel's per-sample outputs that the objectives need; None if an
+    objective needs an output that the kernel lacks."""
     wanted: set[str] = set()
     for objective in objectives:
         if objective.needs is None:
@@ -429,21 +443,22 @@ def _needs(objectives: Sequence[Objective]) -> tuple[str, ...] | None:
 
 
 class LockedEvaluator:
-    """Evaluates box paths with every redundant joint at one constant position.
+    """Evaluator for box paths with every redundant joint locked at one position.
 
-    A redundant joint with a constant path gives what the arm with that joint locked gives, so that
-    one compiled cell serves all positions. Decision vectors are the free waypoints of the box.
+    A redundant joint on a constant path moves like an arm with this joint locked, so one compiled
+    cell serves all positions. Decision vectors are the free waypoints of the box.
     """
 
     def __init__(self, evaluator: CandidateEvaluator, positions: Array) -> None:
-        """Lock the joints.
+        """Lock the redundant joints.
 
         Args:
-            evaluator: of a cell in which redundant joints are free at all waypoints.
-            positions: (m,) where they stand [rad or m].
+            evaluator: evaluator of a cell in which redundant joints are free at all waypoints.
+            positions: (m,) positions of the redundant joints [rad or m].
 
         Raises:
-            SettingsError: a redundant joint is fixed somewhere, or positions are not one per joint.
+            SettingsError: a redundant joint is fixed at a waypoint, or the number of positions is
+                wrong.
         """
         task = evaluator.workcell.task
         n = len(task.waypoints)
@@ -458,11 +473,12 @@ class LockedEvaluator:
         self.lower, self.upper = evaluator.lower[: self.n_var], evaluator.upper[: self.n_var]
 
     def evaluate(self, x: Array) -> Evaluations:
-        """Evaluate box paths (n, n_var)."""
+        """Evaluate box paths x (n, n_var)."""
         return replace(self._evaluator.evaluate(self._whole(x)), x=x)
 
     def certified(self, evaluations: Evaluations) -> Evaluations:
-        """Certify as `CandidateEvaluator.certified`."""
+        """Return the evaluations with a feasible front proven free of collisions, as
+        `CandidateEvaluator.certified` does."""
         whole = replace(evaluations, x=self._whole(evaluations.x))
         return replace(self._evaluator.certified(whole), x=evaluations.x)
 

@@ -17,10 +17,10 @@ from symbolic.records import Contact, Robot
 from symbolic.records.poses import box_placement, inverse
 
 DAMPED_STEPS = 60
-"""Damped steps in which an arm goes as near to a pose as it can."""
+"""Number of damped steps that bring an arm as near to a pose as it can get."""
 
 RADIAN_LENGTH = 0.1
-"""Length that a radian counts beside a distance [m]."""
+"""Length that an orientation error of one radian counts as beside a distance [m]."""
 
 DAMPING = 1e-4
 """Damping of these steps, squared [m^2]."""
@@ -33,13 +33,13 @@ class Explanation:
     Attributes:
         reason: one of `hybrid_opt.evaluate.evaluation.REASONS`.
         position: path parameter of the sample.
-        sample: its number, from 0.
-        pair: names of the bodies that collide there, None for another reason.
-        joint: 'robot/joint' that is beyond a limit there, likewise.
-        excess: how far the joint is beyond it [rad, or m of a joint that slides].
+        sample: index of the sample, from 0.
+        pair: names of the two bodies that collide; None for another reason.
+        joint: 'robot/joint' beyond its limit; None for another reason.
+        excess: distance of this joint beyond its limit [rad, or m for a sliding joint].
         unit: unit of the excess.
-        robot: name of the arm that does not reach, likewise.
-        missing: how far its flange stays from where it has to be, at best [m].
+        robot: name of the arm that does not reach its contact; None for another reason.
+        missing: least distance of this arm's flange from the place that it has to reach [m].
     """
 
     reason: str
@@ -64,11 +64,11 @@ class Explanation:
 
 
 def explain(evaluator: CandidateEvaluator, evaluations: Evaluations) -> tuple[Explanation, ...]:
-    """Explain, in order, why each infeasible candidate fails.
+    """Explain why each infeasible candidate fails, in the order of the candidates.
 
     Args:
-        evaluator: that judged them.
-        evaluations: as it gave them.
+        evaluator: the evaluator of the candidates.
+        evaluations: evaluations by this evaluator.
     """
     rows = np.flatnonzero(~evaluations.feasible)
     found = []
@@ -80,7 +80,8 @@ def explain(evaluator: CandidateEvaluator, evaluations: Evaluations) -> tuple[Ex
 
 
 def frequent(explanations: Iterable[Explanation]) -> dict[str, dict[str, int]]:
-    """Count the failures per pair, joint and arm, the most frequent first."""
+    """Count failures by colliding pair ('pairs'), joint ('joints') and arm out of reach ('reach'),
+    the most frequent first."""
     counts: dict[str, Counter[str]] = {"pairs": Counter(), "joints": Counter(), "reach": Counter()}
     for one in explanations:
         if one.pair is not None:
@@ -125,15 +126,15 @@ def _explained(
 
 
 def missing_reach(robot: Robot, contact: Contact, T_world_box: Array, q: Array) -> float:
-    """Compute the least distance of an arm's flange from where it would hold the box [m].
+    """Compute how far the flange of an arm stays from the place at which it would hold the box [m].
 
-    The distance where position and orientation together are nearest, joints within their limits;
-    found by damped least squares from one posture, so another posture may come nearer.
+    Damped least squares bring position and orientation together as near as the joint limits allow,
+    from one posture. From another posture the flange may come nearer.
 
     Args:
         robot, contact: the arm and its contact.
-        T_world_box: (4, 4), where the box is.
-        q: (n,) posture to begin with.
+        T_world_box: (4, 4) pose of the box.
+        q: (n,) initial posture [rad].
     """
     model = arm_model(robot)
     data, flange = model.createData(), link_frame(model, robot.flange)

@@ -41,7 +41,7 @@ from symbolic.geometry.pairs import CellGeometry
 from symbolic.records import POSE_SIZE, Workcell
 
 _LEAST_ROOM = 4096
-"""Open pairs that are collected before they are handed on, beside those of one pass."""
+"""Number of open pairs for which there is room beyond those of one pass."""
 
 _RESTING = np.dtype([("pair", np.int64), ("place", np.float64, 3), ("departure", np.float64)])
 
@@ -50,15 +50,16 @@ _TABLE = np.dtype([("bounds", np.uintp), ("robot", np.int64), ("joint", np.int64
 
 @dataclass(frozen=True)
 class SampledVerdicts:
-    """A cell's evaluation in lanes. Not to be shared between threads, since its checker is not.
+    """Constraint violations and collisions of n candidates on their samples.
 
     Attributes:
         outputs: 'time' (n, samples) [s], 'violation' and 'violation_time' (n, constraints), and
-            what else was asked for, as `symbolic.functions.candidate_function` has them.
-        first_sample: (n,) the first sample that violates a constraint; the number of samples
-            where none does.
-        first_reason: (n,) the first constraint violated there, -1 where none is.
-        colliding: (n, samples) whether a sample collides; only samples that both arms reach can.
+            further outputs of `symbolic.functions.candidate_function` on request.
+        first_sample: (n,) first sample that violates a constraint; the number of samples if none
+            does.
+        first_reason: (n,) first constraint violated at this sample; -1 if none is.
+        colliding: (n, samples) True for samples in collision. Samples after an arm has lost the
+            path are False.
     """
 
     outputs: Mapping[str, Array]
@@ -68,7 +69,8 @@ class SampledVerdicts:
 
 
 def evaluate_numpy(outputs: Mapping[str, Array], checker: CollisionChecker) -> SampledVerdicts:
-    """Compute the verdicts from every per-sample output of the candidate function, in NumPy."""
+    """Compute violations and collisions in NumPy, from every per-sample output of the candidate
+    function."""
     violated = np.asarray(outputs["constraint"] > 0.0)
     bad = np.asarray(np.any(violated, axis=2))
     n, samples = bad.shape
@@ -85,8 +87,13 @@ def evaluate_numpy(outputs: Mapping[str, Array], checker: CollisionChecker) -> S
 
 
 def reached_samples(outputs: Mapping[str, Array], row: int) -> tuple[Array, Array, Array]:
-    """Return box poses and both arms' joints at a candidate's samples before an arm loses the path:
-    only those can collide."""
+    """Return box poses and joints of both arms at the samples of a candidate before an arm loses
+    the path. Only these can collide.
+
+    Args:
+        outputs: per-sample outputs of the candidate function.
+        row: index of the candidate.
+    """
     lost = (outputs["lost_1"][row] > 0.0) | (outputs["lost_2"][row] > 0.0)
     reached = int(np.argmax(lost)) if lost.any() else len(lost)
     pose, q_1, q_2 = (outputs[name][row, :reached] for name in ("pose", "q_1", "q_2"))
@@ -94,8 +101,14 @@ def reached_samples(outputs: Mapping[str, Array], row: int) -> tuple[Array, Arra
 
 
 def collision_shares(colliding: NDArray[np.bool_], time: Array) -> Array:
-    """Compute the share (n,) of the duration of the colliding samples (n, samples), each for half
-    of both neighbouring steps; times (n, samples) [s]."""
+    """Compute the share (n,) of the duration that is spent in collision.
+
+    A colliding sample counts for half of both neighbouring steps.
+
+    Args:
+        colliding: (n, samples) True for samples in collision.
+        time: (n, samples) [s].
+    """
     shares, halves = np.zeros(len(time)), np.diff(time) / 2.0
     durations = np.zeros(time.shape)
     durations[:, :-1] += halves
@@ -106,20 +119,24 @@ def collision_shares(colliding: NDArray[np.bool_], time: Array) -> Array:
 
 
 class Kernel:
-    """A cell's evaluation in lanes. Not to be shared between threads, as its checker.
+    """Evaluation of a cell's candidates in lanes. Threads must not share one, because it owns a
+    checker.
 
     Attributes:
-        lanes: candidates side by side.
+        lanes: number of candidates evaluated side by side.
     """
 
     def __init__(
         self, library: ctypes.CDLL, checker: CollisionChecker, numbers: Array, start: Array
     ) -> None:
-        """Prepare the shapes; `load_kernel` gives the library.
+        """Prepare the collision shapes.
 
         Args:
-            numbers: (n,) of the cell, its groups one after the other.
-            start: joints of both arms, side by side, that hold the box at the start.
+            library: compiled kernel, from `load_kernel`.
+            checker: collision checker that decides open pairs.
+            numbers: (n,) parameters of the cell, group after group.
+            start: joints of the first arm, then of the second, that hold the box at the start
+                [rad].
         """
         self._evaluate = library.dual_arm_evaluate
         self._evaluate.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_longlong]
@@ -142,17 +159,18 @@ class Kernel:
         begin: Array | None = None,
         all_forces: bool = False,
     ) -> SampledVerdicts:
-        """Evaluate decision vectors (n, n_var).
+        """Evaluate decision vectors on their samples.
 
         Args:
-            wanted: those of `sample_sizes` that are needed per sample.
-            with_collisions: False leaves collisions out.
-            begin: joints of both arms, side by side, that hold the box at the start; None for
-                those of the cell's start branches.
-            threads: to spread the candidates over; 0 for one per core. Has no influence on the
-                results; FCL's part runs in the calling thread.
-            all_forces: False leaves forces at zero, in cells whose forces a program finds, where
-                something else is violated already.
+            x: (n, n_var).
+            wanted: names of `sample_sizes` to be returned per sample.
+            with_collisions: False skips the collision check.
+            threads: number of threads; 0 for one per core. The results do not depend on it. FCL's
+                part runs in the calling thread.
+            begin: joints of the first arm, then of the second, that hold the box at the start
+                [rad]; None for the cell's start branches.
+            all_forces: False leaves contact forces at zero if another constraint is already
+                violated, in cells whose forces are the solution of a program.
 
         Raises:
             CodegenError: memory is short.
@@ -213,7 +231,8 @@ class Kernel:
         begin: Array | None,
         **choices: bool,
     ) -> list[NDArray[np.void]]:
-        """Run the kernel on candidates of one thread; return the pairs that it leaves open."""
+        """Run the kernel on the candidates of one thread; return the pairs that it leaves to
+        FCL."""
         n = len(arrays["x"])
         room = np.empty(self._room if choices["with_collisions"] else 0, self._open_pair)
         pointers = (ctypes.c_void_p * len(wanted))(*wanted)
@@ -238,7 +257,7 @@ class Kernel:
         return found
 
     def _judged(self, left: NDArray[np.void]) -> NDArray[np.bool_]:
-        """Have the checker decide open pairs, at least one."""
+        """Decide open pairs, at least one, by the checker: True for collisions."""
         configuration = self._checker.split(left["configuration"])
         return self._checker.collisions(*configuration, np.arange(len(left)), left["pair"])
 
@@ -251,14 +270,16 @@ def load_kernel(
 ) -> Kernel | None:
     """Load or build the kernel of a cell.
 
-    It is only used where it gives the bits of the functions that it is made of.
+    The kernel is used only if it gives the same bits as the functions that it is made of.
 
     Args:
-        outputs: of decision vectors, as the candidate function has them.
-        lanes: candidates side by side; 0 for what suits the machine.
+        compiled: the workcell with its compiled functions.
+        checker: collision checker of the workcell.
+        outputs: function from decision vectors to outputs of the candidate function.
+        lanes: number of candidates side by side; 0 for the machine's width.
 
     Returns:
-        None on a machine without lanes; with one warning where the kernel fails.
+        The kernel; None on a machine without lanes, or, with a warning, if the kernel fails.
     """
 
     def make() -> Mapping[str, Any]:
@@ -292,8 +313,7 @@ def load_kernel(
 
 
 def _same(found: SampledVerdicts, expected: SampledVerdicts) -> bool:
-    """Return True if two evaluations agree to the last bit, in everything that the first one
-    has."""
+    """Return True if two evaluations agree to the last bit in every output of the first one."""
     pairs = [(values, expected.outputs[name]) for name, values in found.outputs.items()]
     pairs += [
         (getattr(found, name), getattr(expected, name))
@@ -303,7 +323,7 @@ def _same(found: SampledVerdicts, expected: SampledVerdicts) -> bool:
 
 
 def _definitions(geometry: CellGeometry) -> str:
-    """Write the sizes for which kernel.c is compiled."""
+    """Return the C definitions of the sizes for which kernel.c is compiled."""
     workcell = geometry.workcell
     sizes = sample_sizes(workcell)
     ends = np.cumsum(list(sizes.values()))
@@ -355,15 +375,15 @@ def _definitions(geometry: CellGeometry) -> str:
 
 
 def _groups(compiled: CompiledCell) -> list[str]:
-    """Return the groups of parameters that the kernel takes, in order: without squeezes of
-    commanded forces."""
+    """Return the names of the parameter groups that the kernel takes, in order. The squeezes of
+    commanded forces are not among them."""
     from symbolic.parameters import SQUEEZES
 
     return [name for name in compiled.numbers.sizes if name not in SQUEEZES]
 
 
 def _given(compiled: CompiledCell) -> str:
-    """Write the macros of kernel.c that locate each function's parameters among all groups."""
+    """Return the C macros of kernel.c that locate each function's parameters among all groups."""
     numbers, groups = compiled.numbers, _groups(compiled)
     sizes = [numbers.sizes[name] for name in groups]
     at = dict(zip(groups, np.cumsum([0, *sizes]).tolist(), strict=False))
@@ -379,12 +399,13 @@ def _given(compiled: CompiledCell) -> str:
 
 
 def configuration_size(workcell: Workcell) -> int:
-    """Return the number of entries of a configuration: box pose, joints of both arms."""
+    """Return the number of entries of a configuration: box pose and joints of both arms."""
     return POSE_SIZE + sum(len(robot.position_lower) for robot in workcell.robots)
 
 
 def open_pair(workcell: Workcell) -> np.dtype[np.void]:
-    """Return `open_pair` of kernel.c: a pair of a sample that FCL has to decide."""
+    """Return the record type `open_pair` of kernel.c: one pair at one sample that FCL has to
+    decide."""
     return np.dtype(
         [
             ("candidate", np.int64),
@@ -396,7 +417,7 @@ def open_pair(workcell: Workcell) -> np.dtype[np.void]:
 
 
 class JudgeData(ctypes.Structure):
-    """`judge_data` of kernel.c."""
+    """The C structure `judge_data` of kernel.c."""
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("pairs", "columns")),
@@ -409,7 +430,7 @@ class JudgeData(ctypes.Structure):
 
 
 class BatchData(ctypes.Structure):
-    """`batch_data` of kernel.c."""
+    """The C structure `batch_data` of kernel.c."""
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("x", "begin", "numbers")),
@@ -422,8 +443,8 @@ class BatchData(ctypes.Structure):
 
 
 def _judge_data(checker: CollisionChecker) -> tuple[JudgeData, dict[str, NDArray[Any]]]:
-    """Return the pairs and margins of a cell, and the memory that they point into, which must
-    outlive them, as must the checker with its bodies."""
+    """Return the pairs and margins of a cell for the kernel, and the arrays that they point into.
+    These arrays and the checker must stay alive as long as the kernel."""
     geometry = checker.geometry
     tables = np.zeros(len(geometry.active), dtype=_TABLE)
     for table in checker.tables:

@@ -21,7 +21,8 @@ Outputs = Mapping[str, Array]
 """Batch outputs of the candidate function, each with a leading axis over candidates."""
 
 Evaluate = Callable[[Outputs, Workcell], Array]
-"""From the batch outputs of n candidates and the workcell to (n,) values, or (n, 2) of robots."""
+"""Function from the batch outputs of n candidates and the workcell to values (n,), or (n, 2) by
+robot."""
 
 
 @dataclass(frozen=True)
@@ -29,10 +30,11 @@ class Objective:
     """One objective to be minimised.
 
     Attributes:
-        name: its name on the command line and in results.
-        title: its name on axes and in tables.
-        evaluate: its values (n,).
-        needs: the outputs that it uses; evaluation is slower where it is not said (None).
+        name: name on the command line and in results.
+        title: name on axes and in tables.
+        evaluate: function that computes the values (n,).
+        needs: names of the outputs that `evaluate` uses; None if unknown, which makes evaluation
+            slower.
     """
 
     name: str
@@ -45,23 +47,22 @@ PAPER_OBJECTIVES = ("peak_force_1", "peak_force_2")
 """The paper's pair: peak normal force of each robot."""
 
 ROBUST_OBJECTIVES = ("robust_force_1", "robust_force_2")
-"""The paper's pair for every case of the workcell's uncertainty."""
+"""The paper's pair, with the forces of every case of the workcell's uncertainty."""
 
 FORCE_PAIRS = (PAPER_OBJECTIVES, ROBUST_OBJECTIVES)
-"""Both robots' peak forces: what the polish of forces minimises."""
+"""Pairs of objectives that the polish of forces minimises: peak forces of both robots."""
 
 
 @dataclass(frozen=True)
 class ForceKind:
-    """Kind of normal forces that are limited and minimised in drivable carries.
+    """Kind of normal force that is limited and minimised in drivable carries: planned or robust.
 
     Attributes:
-        robust: whether they hold in every case of the workcell's uncertainty.
-        drivable: the pair of objectives of drivable cells: how long a carry takes and how
-            hard it presses.
-        name: of the forces, in sentences.
-        title: of the largest force, for axes.
-        pressing: words before the largest force, where a carry is described.
+        robust: whether the force holds the box in every case of the workcell's uncertainty.
+        drivable: names of the two objectives of drivable cells: duration and largest force.
+        name: name of the force in sentences.
+        title: title of the largest force on axes.
+        pressing: words before the largest force in the description of a carry.
     """
 
     robust: bool
@@ -89,7 +90,7 @@ ROBUST_FORCE = ForceKind(
 DRIVABLE_OBJECTIVES = PLANNED_FORCE.drivable
 ROBUST_DRIVABLE_OBJECTIVES = ROBUST_FORCE.drivable
 DRIVABLE_PAIRS = (DRIVABLE_OBJECTIVES, ROBUST_DRIVABLE_OBJECTIVES)
-"""What the drivable experiment may be about."""
+"""Pairs of objectives of the drivable experiment."""
 
 
 def _of_robot(robot: int, forces: Evaluate) -> Evaluate:
@@ -101,8 +102,8 @@ def _larger(forces: Evaluate) -> Evaluate:
 
 
 def _peak_forces(outputs: Outputs, workcell: Workcell) -> Array:
-    """Return the peak normal forces (n, 2) over the reference forces, of the whole path if the
-    timing has them."""
+    """Return the peak normal forces (n, 2) over the reference forces: of the whole path if the
+    timing knows them, else of the samples."""
     known = outputs.get("peak_force")
     peaks = outputs["normal_force"].max(axis=1) if known is None else known
     return np.asarray(peaks / workcell.task.reference_force)
@@ -116,7 +117,7 @@ def _mean_force(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _duration(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the duration over twice the time of the initial trajectory's polygon."""
+    """Compute the duration over `duration_unit`."""
     duration = outputs["time"][:, -1] / duration_unit(workcell)
     return np.asarray(duration, dtype=float)
 
@@ -138,8 +139,8 @@ def _force_imbalance(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _joint_length(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the Euclidean length of the path of all joints of both arms, over that of their
-    ranges."""
+    """Compute the length of the path of both arms in joint space over the length of the joint
+    ranges (Euclidean)."""
     steps = [np.diff(outputs[name], axis=1) for name in _JOINTS]
     length = np.sqrt(sum((step**2).sum(axis=2) for step in steps)).sum(axis=1)
     ranges = workcell.stack_joint_limits("position_upper") - workcell.stack_joint_limits(
@@ -149,11 +150,12 @@ def _joint_length(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the share of friction used at the reference squeeze.
+    """Compute the largest share of the friction that is used if both pads press with the reference
+    force.
 
-    With the least normal forces the cones are tight by construction, so the margin is taken at
-    the reference forces: both pads squeeze as hard as they may, the needed coefficient is
-    F_t / (N_1 + N_2) with N_1 - N_2 = F_n, and its share of the smaller coefficient is returned.
+    With the least normal forces friction is fully used by construction. So the forces are raised to
+    the reference forces. The needed coefficient is then F_t / (N_1 + N_2) with N_1 - N_2 = F_n; the
+    result is its share of the smaller friction coefficient.
     """
     force = outputs["normal_force"]
     difference = np.abs(force[:, :, 0] - force[:, :, 1])
@@ -164,10 +166,10 @@ def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _robust_forces(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the peaks (n, 2) over the reference force of each arm's robust force.
+    """Compute the peak robust force of each arm (n, 2) over its reference force.
 
-    Arm 1 leads, the force of arm 2 is commanded (`hybrid_opt.robust`). A timing that limits robust
-    forces gives the peaks of the whole path.
+    Arm 1 leads; arm 2 presses with the commanded force (`hybrid_opt.robust`). If the timing limits
+    robust forces, the peaks are those of the whole path, else of the samples.
     """
     if "robust_force" in outputs:
         return np.asarray(outputs["robust_force"] / workcell.task.reference_force)
@@ -183,8 +185,8 @@ def _robust_forces(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def duration_unit(workcell: Workcell) -> float:
-    """Compute the time [s] that the objective `duration` counts as one: twice that along the
-    hand-made trajectory's straight pieces at the reference speeds."""
+    """Compute the time [s] that the objective `duration` counts as one: twice the time along the
+    straight pieces of the hand-made trajectory at the reference speeds."""
     return 2.0 * workcell.task.initial_time
 
 
@@ -245,11 +247,11 @@ _ROBUST = tuple(OBJECTIVES[name].evaluate for name in ("robust_force", *ROBUST_O
 
 
 def force_kind(objectives: Sequence[str | Objective]) -> ForceKind:
-    """Return the kind of forces that drivable cells limit: robust ones if those are
-    minimised.
+    """Return the kind of force that drivable cells limit: robust if a robust force is minimised,
+    else planned.
 
     Raises:
-        SettingsError: as of `select_objectives`.
+        SettingsError: an objective is unknown or given twice, or none is given.
     """
     chosen = select_objectives(objectives)
     robust = any(objective.evaluate in _ROBUST for objective in chosen)
@@ -257,7 +259,7 @@ def force_kind(objectives: Sequence[str | Objective]) -> ForceKind:
 
 
 def select_objectives(wanted: Sequence[str | Objective]) -> tuple[Objective, ...]:
-    """Return the wanted objectives in order: named ones of `OBJECTIVES`, and own records.
+    """Return the objectives in the given order, names replaced by their records in `OBJECTIVES`.
 
     Raises:
         SettingsError: a name is unknown or given twice, or none is given.

@@ -1,5 +1,5 @@
-"""Figures of fronts.
+"""Indicators of fronts.
 
-metrics: hypervolume, IGD, spacing, counts, bounds that decide. statistics: medians, rank tests,
-effect sizes, surfaces over replicas.
+metrics: hypervolume, IGD, spacing, counts, and bounds of variables that optima lie on. statistics:
+medians, rank tests, effect sizes, attainment surfaces over replicas.
 """

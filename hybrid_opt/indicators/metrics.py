@@ -4,11 +4,11 @@ All objectives are minimised. A front is an (n, n_obj) array of objectives. Hype
 spacing compare objectives of different units, so normalise first, and with the same bounds for
 everything that is compared.
 
-A bound of a decision variable that an optimum lies on may have decided it: wider ones might allow
-better carries. One that none lies on decided nothing but where the search looked.
+An optimum on a bound of a decision variable may be an effect of this bound: wider bounds might
+allow better carries. A bound that no optimum lies on only limited the region of the search.
 
-moocore and SciPy are imported where they compute: both take long to start, and a carry needs
-neither.
+moocore and SciPy are imported in the functions that use them: both take long to start, and a carry
+needs neither.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ REFERENCE_POINT = (1.1, 1.1)
 """Reference point of the hypervolume, in normalised objectives (the paper's)."""
 
 ON_BOUND = 1e-3
-"""Nearer to a bound than this share of the variable's range counts as on it: an interior-point
+"""A variable counts as on its bound if it is nearer than this share of its range: an interior-point
 method stops a little inside."""
 
 
@@ -50,13 +50,14 @@ def normalise(objectives: ArrayLike, ideal: ArrayLike, nadir: ArrayLike) -> Arra
 
 
 def non_dominated(objectives: ArrayLike, feasible: ArrayLike | None = None) -> Mask:
-    """Return the mask (n,) of the feasible points that no feasible point dominates.
+    """Return a mask (n,) of the feasible points that no feasible point dominates.
 
-    The first of equal points is kept. A point with a NaN or infinite objective is never in.
+    Of equal points the first is kept. A point with a NaN or infinite objective is never in the
+    mask.
 
     Args:
         objectives: (n, n_obj).
-        feasible: (n,) bool, None for all.
+        feasible: (n,) bool, None if all are feasible.
     """
     import moocore
 
@@ -72,19 +73,21 @@ def non_dominated(objectives: ArrayLike, feasible: ArrayLike | None = None) -> M
 
 
 def front_rows(objectives: ArrayLike, feasible: ArrayLike | None = None) -> NDArray[np.intp]:
-    """Return the rows (k,) of the non-dominated feasible points, by increasing objectives."""
+    """Return the row indices (k,) of the non-dominated feasible points, ordered by their
+    objectives."""
     values = np.asarray(objectives, dtype=np.float64)
     rows = np.flatnonzero(non_dominated(values, feasible))
     return rows[np.lexsort(values[rows].T[::-1])]
 
 
 def reference_point(n_obj: int) -> tuple[float, ...]:
-    """Return the paper's reference point of the hypervolume, for any number of objectives."""
+    """Return the paper's reference point of the hypervolume for `n_obj` objectives."""
     return (REFERENCE_POINT[0],) * n_obj
 
 
 def front_of(objectives: ArrayLike, feasible: ArrayLike | None = None) -> Array:
-    """Return the non-dominated feasible objectives (k, n_obj), by increasing first objective."""
+    """Return the objectives (k, n_obj) of the non-dominated feasible points, by increasing first
+    objective."""
     values = np.asarray(objectives, dtype=np.float64)
     return np.asarray(values[front_rows(values, feasible)])
 
@@ -113,8 +116,8 @@ def igd(front: ArrayLike, reference_front: ArrayLike) -> float:
 
 
 def igd_plus(front: ArrayLike, reference_front: ArrayLike) -> float:
-    """Compute IGD with only the components in which the front is worse than the reference; weakly
-    Pareto compliant; infinite for an empty front.
+    """Compute IGD+: IGD with distances over only those objectives in which the front is worse than
+    the reference point. It is weakly Pareto compliant; infinite for an empty front.
 
     Source: Ishibuchi, Masuda, Tanigaki and Nojima 2015.
     """
@@ -131,12 +134,11 @@ def _mean_distance(of_moocore: str, front: ArrayLike, reference_front: ArrayLike
 
 
 def spacing(front: ArrayLike) -> float:
-    """Compute the sample standard deviation (divisor n - 1) of each point's L1 distance to its
-    nearest neighbour; 0 is even.
+    """Compute the standard deviation (divisor n - 1) of each point's L1 distance to its nearest
+    neighbour. 0 means even spacing.
 
-    NaN for fewer than three points: one has no neighbour, and two are always evenly spaced.
-    Says nothing about convergence or extent, so never use it alone.
-    Source: Schott 1995.
+    NaN for fewer than three points: one point has no neighbour, and two are always evenly spaced.
+    Spacing says nothing about convergence or extent, so do not use it alone. Source: Schott 1995.
     """
     from scipy.spatial import cKDTree
 
@@ -153,7 +155,7 @@ def feasible_count(feasible: ArrayLike) -> int:
 
 
 def feasible_share(feasible: ArrayLike) -> float:
-    """Compute the feasible points as a fraction of all, in [0, 1]; NaN without points."""
+    """Compute the share of feasible points among all, in [0, 1]; NaN if there are no points."""
     mask = np.asarray(feasible, dtype=bool)
     return feasible_count(mask) / len(mask) if len(mask) > 0 else float("nan")
 
@@ -161,7 +163,8 @@ def feasible_share(feasible: ArrayLike) -> float:
 def best_so_far(objectives: ArrayLike, feasible: ArrayLike) -> Array:
     """Compute the least feasible value (n, n_obj) of each objective up to each evaluation.
 
-    NaN before the first feasible point. The objectives' minima may belong to different points.
+    The value is NaN before the first feasible point. The minima of different objectives may belong
+    to different points.
     """
     values = np.asarray(objectives, dtype=np.float64)
     usable = np.asarray(feasible, dtype=bool) & np.isfinite(values).all(axis=1)
@@ -174,7 +177,7 @@ def excess_above_static(objectives: ArrayLike, static: ArrayLike) -> Array:
 
     Args:
         objectives: (..., n_obj) normalised peak normal forces.
-        static: (n_obj,) or scalar, the same figures at rest, positive.
+        static: (n_obj,) or scalar, normalised normal forces at rest, positive.
     """
     ratio = np.asarray(objectives, dtype=np.float64) / np.asarray(static, dtype=np.float64)
     return np.asarray(100.0 * (ratio - 1.0))
@@ -182,13 +185,13 @@ def excess_above_static(objectives: ArrayLike, static: ArrayLike) -> Array:
 
 @dataclass(frozen=True)
 class BindingBound:
-    """A bound that solutions lie on.
+    """A bound of a decision variable that solutions lie on.
 
     Attributes:
-        variable: its name, as 'waypoint 2, yaw' or 'force limit'.
-        side: which of its bounds.
-        value: of the bound [m, rad, N].
-        solutions: how many lie on it.
+        variable: name of the variable, such as 'waypoint 2, yaw' or 'force limit'.
+        side: lower or upper bound.
+        value: value of the bound [m, rad, N].
+        solutions: number of solutions on the bound.
     """
 
     variable: str
@@ -203,8 +206,8 @@ class BindingBound:
 def binding_bounds(task: Task, x: Array) -> tuple[BindingBound, ...]:
     """Return the bounds that decision vectors (k, n_var) lie on, in the order of the variables.
 
-    A variable whose bounds are equal has no range and is left out. So are the bounds of the force
-    limit: they are where a front ends, the force at rest and the robots' own limit.
+    Variables with equal bounds are left out, since they have no range. The bounds of the force
+    limit are left out too: a front naturally ends at the force at rest and at the robots' limit.
     """
     x = np.asarray(x, dtype=float).reshape(-1, task.n_var)
     width = task.upper - task.lower

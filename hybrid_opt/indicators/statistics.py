@@ -1,7 +1,9 @@
-"""Statistics over the replicas of a campaign: summaries, rank tests with effect sizes, surfaces.
+"""Statistics over the replicas of a campaign: summaries, rank tests with effect sizes, attainment
+surfaces.
 
-An empirical attainment surface holds the objectives that a share of the replicas reached or
-bettered. Source: Fonseca, Guerreiro, Lopez-Ibanez and Paquete 2011, through moocore's `eaf`.
+An empirical attainment surface bounds the region of objectives that a given share of the replicas
+attained or bettered. Source: Fonseca, Guerreiro, Lopez-Ibanez and Paquete 2011, through moocore's
+`eaf`.
 """
 
 from __future__ import annotations
@@ -22,13 +24,13 @@ Magnitude = Literal["negligible", "small", "medium", "large"]
 
 @dataclass(frozen=True)
 class Summary:
-    """One figure over replicas; values that are NaN or infinite are counted and left out.
+    """Summary of one figure over replicas. NaN and infinite values are counted and left out.
 
     Attributes:
-        count: finite values.
-        missing: values that are not finite.
+        count: number of finite values.
+        missing: number of values that are not finite.
         mean: arithmetic mean, NaN without values.
-        std: sample standard deviation (divisor count - 1), NaN below two values.
+        std: sample standard deviation (divisor count - 1), NaN for fewer than two values.
         minimum, quartile1, median, quartile3, maximum: order statistics, quartiles by linear
             interpolation (Hyndman and Fan 1996, type 7); NaN without values.
     """
@@ -60,14 +62,15 @@ class RankTest:
 
     Attributes:
         first, second: names of the samples.
-        count_first, count_second: values that took part (infinite ones rank, NaN do not).
+        count_first, count_second: numbers of values compared (infinite values take part, NaN do
+            not).
         u: Mann-Whitney's U of the first sample.
         p: exact two-sided p-value, NaN where a sample is empty.
-        p_holm: after Holm's correction over the family, equal to `p` outside of one.
+        p_holm: p-value after Holm's correction over a family of tests; `p` for a single test.
         a12: Vargha and Delaney's effect size, the chance that a value of the first sample
             exceeds one of the second, ties counting half; 0.5 is no effect.
-        magnitude: of |a12 - 0.5|: small from 0.06, medium from 0.14, large from 0.21.
-        figure: the compared figure, '' if stated elsewhere.
+        magnitude: word for |a12 - 0.5|: small from 0.06, medium from 0.14, large from 0.21.
+        figure: name of the compared figure, '' if stated elsewhere.
     """
 
     first: str
@@ -93,7 +96,7 @@ def rank_test(
 
     Args:
         first, second: (n,), (m,) values; NaN are left out.
-        names: how to call the samples.
+        names: names of the samples.
     """
     # Not imported at the top: it takes half a second, and the workers of a study rank nothing.
     from scipy.stats import mannwhitneyu, rankdata
@@ -123,10 +126,12 @@ def magnitude_of(a12: float) -> Magnitude:
 
 
 def holm(p_values: Sequence[float]) -> tuple[float, ...]:
-    """Apply Holm's (1979) step-down correction for several tests; NaN stay and do not count.
+    """Adjust p-values of several tests by Holm's (1979) step-down correction.
+
+    NaN values stay NaN and do not count as tests.
 
     Returns:
-        Adjusted p-values in the given order.
+        Adjusted p-values in the order of `p_values`.
     """
     p = np.asarray(p_values, dtype=np.float64)
     adjusted = np.full(len(p), np.nan)
@@ -138,7 +143,7 @@ def holm(p_values: Sequence[float]) -> tuple[float, ...]:
 
 
 def corrected(tests: Sequence[RankTest]) -> tuple[RankTest, ...]:
-    """Return the tests of one family with Holm's correction in `p_holm`."""
+    """Return the tests of one family with `p_holm` set by Holm's correction."""
     adjusted = holm([test.p for test in tests])
     return tuple(replace(test, p_holm=p_holm) for test, p_holm in zip(tests, adjusted, strict=True))
 
@@ -155,9 +160,10 @@ def _ranked(values: ArrayLike) -> Array:
 
 
 def _exact_with_ties(ranks: Array, count: int) -> tuple[float, float]:
-    """Compute U and two-sided p of the first `count` midranks, over all ways to choose them.
+    """Compute U and the two-sided p-value of the first `count` midranks, over all ways to choose as
+    many.
 
-    Counts the subsets of each size by their sum of doubled (hence whole) midranks.
+    Counts the subsets of each size by the sum of their doubled (hence whole) midranks.
     """
     doubled = np.rint(2.0 * ranks).astype(np.int64)
     total = int(doubled.sum())
@@ -176,16 +182,19 @@ def _exact_with_ties(ranks: Array, count: int) -> tuple[float, float]:
 def attainment_surfaces(
     fronts: Sequence[ArrayLike], percentiles: Sequence[float] = (25.0, 50.0, 75.0)
 ) -> dict[float, Array]:
-    """Compute attainment surfaces of replicas' fronts by percentile: goals that this percentage
-    attains.
+    """Compute the attainment surfaces of replicas' fronts.
 
-    Each is given by its corners (k, n_obj), by increasing first objective; it is empty where fewer
-    fronts than that hold any point. A surface belongs to the least number of fronts that makes up
-    its percentile. An empty front counts as a replica that attains nothing.
+    A surface of percentile p bounds the points that at least p percent of the fronts attain: the
+    least number of fronts that makes up p percent. It is given by its corners, by increasing first
+    objective. It has no corners if fewer fronts than that hold any point. An empty front counts as
+    a replica that attains nothing.
 
     Args:
         fronts: one (k_i, n_obj) front per replica, n_obj 2 or 3.
         percentiles: in (0, 100].
+
+    Returns:
+        Corners (k, n_obj) by percentile.
 
     Raises:
         SettingsError: no fronts, or a percentile out of range.

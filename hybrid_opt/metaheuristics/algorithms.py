@@ -1,6 +1,7 @@
-"""Search algorithms on pymoo's interface, with guarantees beyond pymoo's: an exact budget and
-finite fronts. NSGA-II, SMS-EMOA and uniform random search; `hybrid_opt.metaheuristics.mopso` has
-MOPSO.
+"""Search algorithms on pymoo's interface: NSGA-II, SMS-EMOA and uniform random search.
+
+They guarantee more than pymoo's: an exact number of evaluations and finite fronts. MOPSO is in
+`hybrid_opt.metaheuristics.mopso`.
 """
 
 from __future__ import annotations
@@ -31,8 +32,8 @@ Points = Annotated[int, Range(1, 100_000)]
 Index = Annotated[float, Range(1.0, 1000.0)]
 
 WORST_OBJECTIVE = 1e30
-"""Stands in for an objective that is not finite: every real point dominates it, and unlike
-infinity it leaves differences and normalisations finite."""
+"""Value in place of an objective that is not finite. Every real point dominates it, and unlike
+infinity it keeps differences and normalisations finite."""
 
 
 def violation_of(objectives: Array, constraints: Array) -> Array:
@@ -43,8 +44,8 @@ def violation_of(objectives: Array, constraints: Array) -> Array:
         constraints: (n, n_con), satisfied where <= 0; n_con may be 0.
 
     Returns:
-        (n,), the sum of positive constraint values: 0 is feasible; infinite where an
-        objective or a constraint is not a finite number below `WORST_OBJECTIVE`.
+        (n,) sum of the positive constraint values: 0 if feasible; infinite if an objective or a
+        constraint is not a finite number below `WORST_OBJECTIVE`.
     """
     total = np.maximum(constraints, 0.0).sum(axis=1)
     sound = (np.abs(objectives) < WORST_OBJECTIVE).all(axis=1) & np.isfinite(constraints).all(
@@ -54,7 +55,7 @@ def violation_of(objectives: Array, constraints: Array) -> Array:
 
 
 def feasible_front(points: Population) -> Population:
-    """Return the feasible, mutually non-dominated members of evaluated points, each value once."""
+    """Return the feasible, mutually non-dominated members of a population, without duplicates."""
     if len(points) == 0:
         return points
     feasible = points[points.get("CV")[:, 0] == 0.0]
@@ -64,13 +65,13 @@ def feasible_front(points: Population) -> Population:
 
 
 class Guarded(Algorithm):  # type: ignore[misc]
-    """Mixin with an exact budget and finite fronts, placed before a pymoo algorithm among the
-    bases.
+    """Mixin that gives a pymoo algorithm an exact budget and finite fronts. List it before the
+    algorithm among the base classes.
 
-    - The last generation is cut so that exactly the evaluations of an `n_eval` termination
-      are spent, for every population size.
-    - A point with a NaN or infinite objective or constraint is infeasible, without limit,
-      also on a problem without constraints; it loses every comparison and enters no front.
+    - The last generation is cut so that exactly the evaluations of an `n_eval` termination are
+    spent, for every population size. - A point with a NaN or infinite objective or constraint
+    counts as infinitely infeasible, also on a problem without constraints. It loses every
+    comparison and enters no front.
     """
 
     def _setup(self, problem: Problem, **kwargs: Any) -> None:
@@ -84,20 +85,22 @@ class Guarded(Algorithm):  # type: ignore[misc]
 
     @property
     def budget(self) -> int | None:
-        """Evaluations that the termination allows in total, None without such a limit."""
+        """Number of evaluations that the termination allows in total; None if it sets no such
+        limit."""
         if isinstance(self.termination, MaximumFunctionCallTermination):
             return int(self.termination.n_max_evals)
         return None
 
     def infill(self) -> Population:
-        """Return the next candidates, at most the remaining budget."""
+        """Return the next candidates, at most as many as the remaining budget."""
         candidates = super().infill()
         if self.budget is None:
             return candidates
         return candidates[: max(self.budget - self.evaluator.n_eval, 0)]
 
     def advance(self, infills: Population | None = None, **kwargs: Any) -> Any:
-        """Take evaluated candidates, with non-finite ones made infeasible first."""
+        """Take evaluated candidates; those with values that are not finite become infeasible
+        first."""
         if infills is not None and len(infills) > 0:
             objectives, constraints = infills.get("F", "G")
             violation = violation_of(objectives, constraints)
@@ -114,7 +117,8 @@ class Guarded(Algorithm):  # type: ignore[misc]
 
 
 class WarmSampling(FloatRandomSampling):  # type: ignore[misc]
-    """Uniform samples within the bounds, the first of them replaced by given points."""
+    """Initial population of uniform samples within the bounds, the first of them replaced by given
+    points."""
 
     def __init__(self, initial: Array | None = None) -> None:
         super().__init__()
@@ -144,14 +148,15 @@ class WarmSampling(FloatRandomSampling):  # type: ignore[misc]
 
 
 class ExhaustiveMating(Mating):  # type: ignore[misc]
-    """Mating that always fills its offspring: uniform samples replace missing unique ones.
+    """Mating that always returns the full number of offspring: uniform samples replace missing
+    unique ones.
 
-    pymoo stops a run early when crossover and mutation yield duplicates only, as happens in a
-    collapsed population; the budget would then not be spent.
+    pymoo stops a run early if crossover and mutation yield only duplicates, as in a collapsed
+    population. The budget would then not be spent.
     """
 
     def do(self, problem: Problem, pop: Population, n_offsprings: int, **kwargs: Any) -> Population:
-        """Return exactly `n_offsprings` offspring of `pop`."""
+        """Return exactly `n_offsprings` offspring of the population `pop`."""
         offspring = super().do(problem, pop, n_offsprings, **kwargs)
         missing = n_offsprings - len(offspring)
         if missing > 0:
@@ -168,11 +173,12 @@ class GeneticSettings:
     """Settings of NSGA-II and SMS-EMOA.
 
     Attributes:
-        population: points per generation; at 1000 evaluations 40 does better than 100.
-        crossover_probability: of simulated binary crossover per mating.
-        crossover_eta: its distribution index, greater keeps children nearer to the parents.
-        mutation_probability: of polynomial mutation per variable, None for 1 / n_var.
-        mutation_eta: its distribution index.
+        population: number of points per generation; at 1000 evaluations 40 does better than 100.
+        crossover_probability: probability of simulated binary crossover per mating.
+        crossover_eta: distribution index of the crossover; larger values keep children nearer to
+            parents.
+        mutation_probability: probability of polynomial mutation per variable; None for 1 / n_var.
+        mutation_eta: distribution index of the mutation.
     """
 
     population: Annotated[int, Range(4, 100_000)] = 40
@@ -187,7 +193,11 @@ class GeneticSettings:
 
 @dataclass(frozen=True)
 class RandomSettings:
-    """Settings of uniform random search. batch: points per evaluation call."""
+    """Settings of uniform random search.
+
+    Attributes:
+        batch: number of points per evaluation call.
+    """
 
     batch: Points = 100
 
@@ -196,19 +206,27 @@ class RandomSettings:
 
 
 class GuardedNsga2(Guarded, NSGA2):  # type: ignore[misc]
-    """NSGA-II (Deb et al. 2002) of pymoo with `Guarded`'s promises; constraint domination where the
-    problem has constraints."""
+    """NSGA-II (Deb et al. 2002) of pymoo with the guarantees of `Guarded`. If the problem has
+    constraints it uses constraint domination."""
 
 
 class GuardedSmsEmoa(Guarded, SMSEMOA):  # type: ignore[misc]
-    """SMS-EMOA (Beume et al. 2007) of pymoo, with a whole generation of offspring at a time;
-    feasible before infeasible where the problem has constraints."""
+    """SMS-EMOA (Beume et al. 2007) of pymoo with the guarantees of `Guarded`. It makes a whole
+    generation of offspring at a time, and prefers feasible points if the problem has
+    constraints."""
 
 
 def genetic(
     kind: type[Algorithm], compare: Any, settings: GeneticSettings, initial: Array | None
 ) -> Algorithm:
-    """Build an algorithm that mates the winners of tournaments decided by `compare`."""
+    """Build a genetic algorithm whose parents are chosen by tournaments.
+
+    Args:
+        kind: class of the algorithm.
+        compare: function that decides a tournament.
+        settings: settings of the algorithm.
+        initial: (k, n_var) decision vectors of the first generation; None for all random.
+    """
     mating = ExhaustiveMating(
         TournamentSelection(func_comp=compare),
         SBX(eta=settings.crossover_eta, prob=settings.crossover_probability),
@@ -219,7 +237,7 @@ def genetic(
 
 
 class RandomSearch(Guarded, Algorithm):  # type: ignore[misc]
-    """Uniform random points within the bounds: the baseline of every search."""
+    """Uniform random points within the bounds, the baseline of every search."""
 
     def __init__(
         self, settings: RandomSettings, initial: Array | None = None, **kwargs: Any

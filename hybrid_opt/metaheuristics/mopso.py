@@ -35,13 +35,13 @@ class MopsoSettings:
     (shifted ZDT1: IGD 0.91).
 
     Attributes:
-        swarm: particles.
+        swarm: number of particles.
         archive: capacity of the external archive.
-        divisions: hypercubes per objective.
-        inertia, cognitive, social: factors of the old velocity, of the pull towards the
-            personal best and of that towards the leader.
-        mutation_share: part of the run over which the turbulence fades to nothing.
-        horizon: evaluations of the whole run, None to take them from the termination.
+        divisions: number of hypercubes per objective.
+        inertia, cognitive, social: factors of the old velocity, of the pull towards the personal
+            best, and of the pull towards the leader.
+        mutation_share: share of the run over which the turbulence fades to zero.
+        horizon: number of evaluations of the whole run; None to take it from the termination.
     """
 
     swarm: Points = 40
@@ -58,14 +58,15 @@ class MopsoSettings:
 
 
 def hypercubes(objectives: Array, divisions: int) -> Indices:
-    """Assign numbers to the occupied hypercubes of the grid that the points themselves span.
+    """Assign each point to a hypercube of the grid that the points themselves span.
 
     Args:
         objectives: (n, n_obj), finite.
-        divisions: cells per objective between the least and the greatest value.
+        divisions: number of cells per objective between the least and the greatest value.
 
     Returns:
-        (n,), for each point its cube, cubes numbered from 0 in no particular order.
+        (n,) number of each point's hypercube. Only occupied cubes have numbers, from 0, in no
+        particular order.
     """
     lowest = objectives.min(axis=0)
     extent = np.ptp(objectives, axis=0)
@@ -78,17 +79,17 @@ def hypercubes(objectives: Array, divisions: int) -> Indices:
 def thin(
     cubes: Indices, newcomer: NDArray[np.bool_], capacity: int, rng: np.random.Generator
 ) -> Indices:
-    """Choose the members that stay when the archive is over capacity.
+    """Choose the members that stay if the archive is over capacity.
 
-    Taking a member from a fullest cube again and again levels all cubes to a common height.
-    The outcome comes from one sort: stack the members of each cube, old ones below newcomers
-    (the papers refuse a newcomer to a fullest cube) and otherwise at random, then keep the
-    lowest of all stacks, at equal height old members first and otherwise at random.
+    Removing a member from a fullest cube again and again levels all cubes to a common height. One
+    sort gives the same outcome. Stack the members of each cube: old members below newcomers (the
+    papers refuse a newcomer to a fullest cube), otherwise in random order. Then keep the lowest
+    members of all stacks; at equal height old members first, otherwise at random.
 
     Args:
         cubes: (n,) cube number of each member.
-        newcomer: (n,) whether the member was not in the archive before.
-        capacity: members that may stay.
+        newcomer: (n,) True for members that were not in the archive before.
+        capacity: number of members that may stay.
         rng: source of randomness.
 
     Returns:
@@ -106,14 +107,15 @@ def thin(
 
 
 class HypercubeArchive:
-    """Non-dominated points found so far, at most `capacity`, feasible before infeasible.
+    """Archive of at most `capacity` non-dominated points.
 
-    While no feasible point is known it holds those of least violation, as guides only.
+    As long as no feasible point is known, it holds the points of least violation as guides. The
+    first feasible point replaces them.
 
     Attributes:
         decisions: (n, n_var).
         objectives: (n, n_obj).
-        violation: (n,), 0 where feasible, otherwise the common least violation.
+        violation: (n,) 0 if feasible, otherwise the common least violation.
     """
 
     def __init__(self, capacity: int, divisions: int, n_var: int, n_obj: int) -> None:
@@ -134,12 +136,12 @@ class HypercubeArchive:
 
         Args:
             decisions: (n, n_var).
-            objectives: (n, n_obj); must be finite where `violation` is.
-            violation: (n,), infinite for points to be refused outright.
+            objectives: (n, n_obj); finite for every point with finite violation.
+            violation: (n,); points with infinite violation are refused.
             rng: source of randomness for thinning.
 
         Returns:
-            Which of [old members, new points], in this order, are members now.
+            Indices of the present members among [old members, new points], in this order.
         """
         all_decisions = np.concatenate([self.decisions, decisions])
         all_objectives = np.concatenate([self.objectives, objectives])
@@ -164,7 +166,7 @@ class HypercubeArchive:
         return members
 
     def leaders(self, count: int, rng: np.random.Generator) -> Indices:
-        """Draw (count,) indices of members as leaders, sparse cubes preferred.
+        """Draw indices (count,) of members as leaders; members of sparse cubes are preferred.
 
         The archive must not be empty.
         """
@@ -189,12 +191,12 @@ def turbulence(
     Args:
         position: (n, n_var).
         lower, upper: (n_var,) bounds.
-        strength: in [0, 1], both the probability that a particle is displaced and the
-            fraction of the bounds' extent that the displacement may cover in total.
+        strength: in [0, 1]. It is the probability that a particle is displaced, and the width of
+            the range of displacements as a share of the bounds' range.
         rng: source of randomness.
 
     Returns:
-        (n, n_var), within the bounds.
+        (n, n_var) positions within the bounds.
     """
     count, n_var = position.shape
     struck = np.flatnonzero(rng.random(count) < strength)
@@ -217,8 +219,8 @@ def replaces_best(
 ) -> Mask:
     """Return True for each particle whose new point becomes its personal best.
 
-    Less violation wins; among equals a dominating point wins, a dominated one loses, and
-    between incomparable ones a fair coin decides.
+    Less violation wins. At equal violation a dominating point wins and a dominated one loses;
+    between incomparable points a fair coin decides.
 
     Args:
         objectives, best_objectives: (n, n_obj).
@@ -233,10 +235,10 @@ def replaces_best(
 
 
 class Mopso(Guarded, Algorithm):  # type: ignore[misc]
-    """MOPSO on pymoo's ask-and-tell interface; `opt` is the archive's feasible part.
+    """MOPSO on pymoo's ask-and-tell interface; `opt` is the feasible part of the archive.
 
-    The turbulence fades over the run, so the number of evaluations must be known: terminate by
-    `n_eval`, or give `settings.horizon`.
+    The turbulence fades over the run, so the number of evaluations has to be known: use an `n_eval`
+    termination, or set `settings.horizon`.
     """
 
     def __init__(

@@ -1,7 +1,7 @@
-"""A search among a cell's carries: the algorithms by name, pymoo's problem, the run that spends the
-evaluations, and the record of all evaluated candidates.
+"""Search among a cell's carries: the algorithms by name, pymoo's problem, the run with its exact
+number of evaluations, and the record of all evaluated candidates.
 
-pymoo's own MOPSO_CD, CMOPSO and NSGA3 draw from unseeded generators.
+pymoo's own MOPSO_CD, CMOPSO and NSGA3 are not offered, because they draw from unseeded generators.
 """
 
 from __future__ import annotations
@@ -131,16 +131,16 @@ def make(
 
 
 ConstraintHandling = Literal["penalty", "constraints"]
-"""How a search learns of infeasibility: by the paper's penalised objectives, or by objectives
-and violations as inequality constraints."""
+"""How a search handles infeasible candidates: by the paper's penalised objectives, or by plain
+objectives with violations as inequality constraints."""
 
 WORST_PENALTY = 1.0 + len(REASONS)
-"""Penalised objective of a candidate whose figures are not finite: as if every constraint were
+"""Penalised objective of a candidate whose figures are not finite: the value for every constraint
 violated all the time."""
 
 
 class Evaluator(Protocol):
-    """Interface of an evaluator for the search, see
+    """Interface that a search needs from an evaluator, such as
     `hybrid_opt.evaluate.evaluation.CandidateEvaluator`."""
 
     objective_names: tuple[str, ...]
@@ -152,15 +152,16 @@ class Evaluator(Protocol):
         """Evaluate decision vectors (n, n_var)."""
 
     def certified(self, evaluations: Evaluations) -> Evaluations:
-        """Return the evaluations with every member of their feasible front proven free between
-        the samples."""
+        """Return the evaluations with every member of the feasible front proven free of collisions
+        between samples."""
 
 
 def reject_non_finite(evaluations: Evaluations) -> Evaluations:
-    """Mark every candidate with a non-finite figure as infeasible and return the evaluations.
+    """Return the evaluations with every candidate that has a non-finite figure marked as
+    infeasible.
 
-    Such a candidate gets `WORST_PENALTY` and the reason `NOT_FINITE`. An infeasible candidate may
-    have non-finite objectives.
+    Such a candidate gets `WORST_PENALTY` and the reason `NOT_FINITE`. The plain objectives of
+    infeasible candidates may be non-finite.
     """
     finite = np.isfinite(evaluations.violation).all(axis=1)
     finite &= np.isfinite(evaluations.violation_time).all(axis=1)
@@ -282,9 +283,9 @@ class SearchResult:
     """Record of a search.
 
     Attributes:
-        evaluated: every point, without limit; fronts and metrics are computed from it.
-        front: the points of the algorithm's own final front (of limited size), feasible only.
-        algorithm_seconds: wall time outside of the problem.
+        evaluated: every evaluated point; fronts and metrics are computed from these.
+        front: the feasible points of the algorithm's own final front, whose size is limited.
+        algorithm_seconds: wall time spent in the algorithm, without evaluations [s].
     """
 
     evaluated: Evaluated
