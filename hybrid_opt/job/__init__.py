@@ -1,1 +1,2 @@
-"""A whole job: grip, press, lift, carry, set down, let go. docs/explanation/job.md describes it."""
+"""A whole job: approach, press, lift, carry, set down, release, retreat. docs/explanation/job.md
+describes it."""

@@ -1,8 +1,9 @@
-"""Effects of stiffness on forces: position-controlled arms, and arms that start at different times.
+"""Effects of the arms' stiffness on forces: position-controlled arms, and arms that start at
+different times.
 
-A position-controlled arm presses by aiming into the box; its stiffness k at the pad turns the
-penetration into force. Both arms hold the box in series, so that a relative displacement d of the
-pads changes the squeeze by k d / 2.
+A position-controlled arm presses by aiming at a point inside the box; its stiffness k at the pad
+turns the penetration into force. Both arms hold the box like springs in series, so a relative
+displacement d of the pads changes the squeeze by k d / 2.
 """
 
 from __future__ import annotations
@@ -22,19 +23,20 @@ from symbolic.errors import SettingsError
 from symbolic.records.poses import box_rotation
 
 STIFFNESSES = (2e3, 1e4, 5e4, 2e5, 1e6)
-"""From a soft Cartesian impedance to a stiff industrial arm [N/m]."""
+"""Stiffnesses that are reported, from a soft Cartesian impedance to a stiff industrial arm
+[N/m]."""
 
 POSITION_ERROR = 1e-4
 """Position error of each arm [m]."""
 
 TRACKED = 0.05
-"""Share of the force by which it may miss its reference and count as tracked."""
+"""A force counts as tracked if it misses its reference by at most this share."""
 
 SKEWS = (0.001, 0.002, 0.005, 0.01, 0.02)
-"""Delays of one arm [s]."""
+"""Delays of one arm that are reported [s]."""
 
 LARGEST_SKEW = 0.1
-"""Largest delay that is looked at [s]."""
+"""Largest delay of one arm that is considered [s]."""
 
 _BISECTIONS = 16
 
@@ -96,7 +98,7 @@ class Skew:
 
 
 def position_control(job: Job, stiffness: float) -> PositionControl:
-    """Compute a job's forces if arms of a stiffness [N/m] track positions.
+    """Compute the forces of a job if arms of a stiffness [N/m] track positions.
 
     Raises:
         SettingsError: the stiffness is not positive.
@@ -110,16 +112,18 @@ def position_control(job: Job, stiffness: float) -> PositionControl:
 
 
 def force_margin(job: Job) -> float:
-    """Compute the least excess of the commanded over the necessary normal force while the box is
-    held [N]."""
+    """Compute the least excess of the commanded normal force over the force that holds the box [N],
+    over the phases in which the box is held."""
     return min(float((p.force.normal - p.force.least).min()) for p in job.held)
 
 
 def skewed(job: Job, delay: float, stiffness: float) -> Skew:
-    """Compute the effect of a delay of one arm while the box is held, for the worse of both arms.
+    """Compute the effect on the forces if one arm is late while the box is held, for the arm with
+    the worse effect.
 
-    The arms are springs, quasi-static. A relative displacement of the pads along the normal changes
-    the squeeze. A displacement across the normal adds a tangential force for friction to bear.
+    The arms act as quasi-static springs. A relative displacement of the pads along the normal
+    changes the squeeze. A displacement across the normal adds a tangential force that friction has
+    to bear.
 
     Args:
         job: the whole job.
@@ -144,8 +148,8 @@ def skewed(job: Job, delay: float, stiffness: float) -> Skew:
 def separation(job: Job, delay: float) -> float:
     """Compute the largest relative displacement of the pads [m] by a delay [s] of either arm.
 
-    Only the phases that hold the box count. An arm that stops alone is also a delayed arm: the
-    delay is then the time that the other arm goes on at the planned speed.
+    Only the phases in which the box is held count. The result also applies to an arm that stops
+    alone: the delay is then the time for which the other arm continues at the planned speed.
     """
     return max(
         float(np.linalg.norm(_displacement(job, phase, late, delay)[1], axis=1).max())
@@ -155,9 +159,8 @@ def separation(job: Job, delay: float) -> float:
 
 
 def largest_skew(job: Job, stiffness: float) -> float:
-    """Compute the longest delay [s] of either arm at which friction holds the box.
-
-    The result is at most `LARGEST_SKEW`.
+    """Compute the longest delay of either arm [s] for which friction still holds the box, at most
+    `LARGEST_SKEW`.
 
     Raises:
         SettingsError: the stiffness is not positive.
@@ -175,7 +178,7 @@ def largest_skew(job: Job, stiffness: float) -> float:
 
 
 def require_skew(job: Job, delay: float, stiffness: float) -> None:
-    """Refuse a job in which friction would not hold the box after a delay of either arm.
+    """Check that friction holds the box of a job if either arm is late.
 
     Args:
         job: the whole job.
@@ -184,7 +187,8 @@ def require_skew(job: Job, delay: float, stiffness: float) -> None:
 
     Raises:
         SettingsError: the stiffness is not positive, or the delay out of range.
-        JobError: friction would not hold the box; the message says by how much, and what would.
+        JobError: friction would not hold the box. The message states the missing force and what
+            would help.
     """
     found = skewed(job, delay, stiffness)
     if found.is_held:
@@ -199,8 +203,12 @@ def require_skew(job: Job, delay: float, stiffness: float) -> None:
 
 
 def _displacement(job: Job, phase: Phase, late: int, delay: float) -> tuple[Array, Array, Array]:
-    """Compute what the delay of an arm does to its pad in a phase: samples (n,) that differ in
-    time, displacement (n, 3) and contact normal (n, 3), world frame [m]."""
+    """Compute how a delay displaces the pad of the late arm in a phase.
+
+    Returns:
+        Mask of the samples with distinct times (n of them), displacement (n, 3) [m] and contact
+        normal (n, 3), both in the world frame.
+    """
     motion, contact = phase.motion, job.workcell.contacts[late]
     keep = np.concatenate([[True], np.diff(motion.time) > 0.0])
     time = motion.time[keep]
@@ -232,7 +240,11 @@ def _skewed(job: Job, phase: Phase, late: int, delay: float, stiffness: float) -
 
 
 def require_stiffness(stiffness: float) -> None:
-    """Refuse a stiffness [N/m] that is not positive."""
+    """Check that a stiffness [N/m] is positive.
+
+    Raises:
+        SettingsError: the stiffness is not positive.
+    """
     if not 0.0 < stiffness < float("inf"):
         raise SettingsError(
             f"stiffness {stiffness:g} N/m: give a finite positive one", code="stiffness"
@@ -240,13 +252,17 @@ def require_stiffness(stiffness: float) -> None:
 
 
 def require_delay(delay: float) -> None:
-    """Refuse a delay [s] out of range."""
+    """Check that a delay [s] is in range.
+
+    Raises:
+        SettingsError: the delay is out of range.
+    """
     if not 0.0 <= delay <= LARGEST_SKEW:
         raise SettingsError(f"skew of {delay:g} s: allowed is 0 to {LARGEST_SKEW:g} s", code="skew")
 
 
 def position_text(found: Sequence[PositionControl]) -> str:
-    """Format the forces under position control, by stiffness."""
+    """Format a table of the forces under position control, one row per stiffness."""
     rows = [
         [
             f"{each.stiffness:g}",
@@ -262,7 +278,7 @@ def position_text(found: Sequence[PositionControl]) -> str:
 
 
 def skew_text(found: Sequence[Skew]) -> str:
-    """Format the effect of a late arm, by delay: the worse of both."""
+    """Format a table of the effects of a late arm, one row per delay."""
     rows = [
         [
             f"{1e3 * each.delay:g}",

@@ -1,12 +1,12 @@
-"""Motions and forces of the phases of a job: straight lines, rest, and the timed carry; and the use
-of each limit in every phase.
+"""Motions and forces of the phases of a job: straight lines, rest, and the timed carry; and the
+utilisation of each limit in every phase.
 
-Every phase beside the carry takes a smooth way from 0 to 1, h(t/T) with
+Every phase except the carry follows a smooth profile h(t/T) from 0 to 1 with
 
     h = 35 s^4 - 84 s^5 + 70 s^6 - 20 s^7,
 
-the polynomial of least degree whose first three derivatives vanish at both ends: a phase begins and
-ends at rest in position, in acceleration and in jerk, so that torques and forces have no corner.
+the polynomial of least degree whose first three derivatives vanish at both ends. A phase begins and
+ends with zero speed, acceleration and jerk, so torques and forces have no corner.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ from symbolic.records.poses import box_rotation
 from symbolic.robot.arm import REACH_TOLERANCE
 
 PHASE_SAMPLES = 401
-"""Samples of a phase."""
+"""Number of samples of a phase."""
 
 LINE_STEP = 0.005
-"""Step of Newton's method from place to place along a line [m]."""
+"""Distance along a line from one Newton solution to the next [m]."""
 
 TICK = 0.008
-"""Phases last a whole number of these [s], so that controllers of 125, 250, 500 and 1000 Hz meet
+"""Phases last a whole number of ticks [s], so that controllers of 125, 250, 500 and 1000 Hz meet
 their ends."""
 
 LIFTING_ACCELERATION = 0.5
-"""Largest of the box when it is lifted off and set down [m/s^2]: a twentieth of gravity, so that
-these short motions need no more force than the carry."""
+"""Largest acceleration of the box when it is lifted and set down [m/s^2]: a twentieth of gravity,
+so that these short motions need no more force than the carry."""
 
 PEAK_RATE = 35.0 / 16.0
-"""Largest h' over s in [0, 1]."""
+"""Largest derivative of h over s in [0, 1]."""
 
 _H = np.polynomial.Polynomial([0.0, 0.0, 0.0, 0.0, 35.0, -84.0, 70.0, -20.0])
 
@@ -57,11 +57,11 @@ _MOVING = ("rate", "second_rate", "q_rate", "q_second")
 
 @dataclass(frozen=True)
 class RestToRestProfile:
-    """The profile and its derivatives by time at n samples, evenly spaced over a duration.
+    """Rest-to-rest profile h and its time derivatives at n evenly spaced samples.
 
     Attributes:
-        time: (n,) from 0 [s].
-        value, rate, second, third: (n,) h and its derivatives by time.
+        time: (n,) from 0 to the duration [s].
+        value, rate, second, third: (n,) h and its first three time derivatives.
     """
 
     time: Array
@@ -72,7 +72,7 @@ class RestToRestProfile:
 
 
 def rest_to_rest_profile(duration: float, samples: int) -> RestToRestProfile:
-    """Compute the rest-to-rest profile from 0 to 1 within a duration [s]."""
+    """Compute the profile from 0 to 1 within a duration [s] at so many samples."""
     share = np.linspace(0.0, 1.0, samples)
     # Rounding must not leave [0, 1]; the last values of a polynomial of degree 7 would.
     value = np.clip(_H(share), 0.0, 1.0)
@@ -83,19 +83,19 @@ def rest_to_rest_profile(duration: float, samples: int) -> RestToRestProfile:
 
 
 def at_even_steps(duration: float, step: float) -> float:
-    """Round the duration up to whole steps [s]."""
+    """Round a duration up to a whole number of steps [s]."""
     return float(np.ceil(duration / step - 1e-9) * step)
 
 
 @dataclass(frozen=True)
 class Straight:
-    """A straight translation of the box, of both pads, or of all.
+    """A straight translation of the box, of both pads, or of both together.
 
     Attributes:
         name: name of the phase.
         box: (2, 6) box poses at beginning and end [m, rad].
-        held: (2, 2, 6) for each arm, the poses at beginning and end of a box that its pad would
-            touch [m, rad]; they differ from `box` where the pad is away from the box.
+        held: (2, 2, 6) for each arm, box poses at beginning and end that place the pad as desired
+            [m, rad]; they differ from `box` while the pad is away from the box.
         speed: largest speed [m/s].
     """
 
@@ -111,8 +111,8 @@ class Straight:
         return float(np.linalg.norm((ways[:, 1] - ways[:, 0])[:, :3], axis=1).max())
 
     def at(self, share: Array) -> tuple[Array, Array, Array]:
-        """Compute poses (n, 6) at shares (n,) of the way: of the box, and those that either pad
-        holds."""
+        """Compute poses (n, 6) at shares (n,) of the line: of the box, then the two box poses that
+        place the pads."""
         ways = np.concatenate([self.box[None], self.held])
         poses = ways[:, None, 0] + share[:, None] * (ways[:, 1] - ways[:, 0])[:, None]
         return poses[0], poses[1], poses[2]
@@ -121,10 +121,12 @@ class Straight:
 def straight(
     workcell: Workcell, name: str, box: Array, away: tuple[float, float], speed: float
 ) -> Straight:
-    """Build the motion of the box between two poses of the same orientation, with both pads along
-    their approach.
+    """Build a straight motion of the box and of both pads between two box poses of the same
+    orientation. Pads move along their directions of approach.
 
     Args:
+        workcell: the workcell.
+        name: name of the phase.
         box: (2, 6) box poses at beginning and end [m, rad].
         away: distance of the pads from the box at beginning and end [m].
         speed: largest speed [m/s].
@@ -140,7 +142,8 @@ def straight(
 def lines_around(
     workcell: Workcell, handling: Handling, stands: tuple[Array, Array], pose: Array
 ) -> tuple[list[Straight], list[Straight]]:
-    """Build the straight motions before a carry and after it, either list from the carry outwards.
+    """Build the straight motions before and after a carry, each list ordered from the carry
+    outwards.
 
     Args:
         handling: heights, speeds and stand-off of the job.
@@ -164,24 +167,27 @@ def lines_around(
 def follow_line(
     workcell: Workcell, posture: NumericFunction, line: Straight, known: Array, at_end: bool
 ) -> Array:
-    """Compute both arms' joints (SAMPLES, joints) along a line, by Newton's method from a known
-    end.
+    """Compute the joints of both arms (PHASE_SAMPLES, joints) along a line, by Newton's method from
+    a known end.
 
-    Samples are at the places that `rest_to_rest_profile` passes at even times. Newton's method goes
-    from place to place every `LINE_STEP`, then from these to all samples at once. Redundant joints
-    stay where they are at the known end.
+    The samples are evenly spaced in the time of the rest-to-rest profile. Newton's method first
+    solves places every `LINE_STEP`, one after the other, then starts from these at all samples
+    together. Redundant joints keep their positions of the known end.
 
     Args:
+        workcell: the workcell.
         posture: compiled `symbolic.robot.arm.posture_function`.
+        line: the line.
         known: (joints,) joint positions at one end of the line [rad].
-        at_end: True if they are known at the end of the line, False if at its beginning.
+        at_end: True if these are the positions at the end of the line, False for its beginning.
 
     Raises:
         JobError: an arm does not reach a place within its joint range.
     """
 
     def share(way: Array) -> Array:
-        """Return the share of the line from its start; `way` is counted from the known end."""
+        """Convert shares of the line counted from the known end to shares counted from its
+        beginning."""
         return 1.0 - way if at_end else way
 
     ways, passed = np.linspace(0.0, 1.0, int(np.ceil(line.length / LINE_STEP)) + 1), [known]
@@ -211,11 +217,8 @@ def follow_line(
 def solve_joints_at(
     workcell: Workcell, posture: NumericFunction, line: Straight, share: Array, guess: Array
 ) -> Array:
-    """Compute both arms' joints (n, joints) at shares (n,) of a line, from guesses (n, joints)
-    [rad].
-
-    Where an arm does not arrive its joints are NaN.
-    """
+    """Compute the joints of both arms (n, joints) at shares (n,) of a line, from initial guesses
+    (n, joints) [rad]. Joints are NaN where an arm does not reach the place."""
     guesses = [np.ascontiguousarray(own) for own in joints_of(workcell, guess)]
     found = []
     for arm, poses in enumerate(line.at(share)[1:], start=1):
@@ -226,10 +229,13 @@ def solve_joints_at(
 
 
 def time_line(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
-    """Compute the motion along a line from rest to rest, as fast as its speed and the limits allow.
+    """Compute the motion along a line from rest to rest, as fast as the line's speed and the limits
+    allow.
 
     Args:
-        q: (SAMPLES, joints) joint positions along the line, as from `follow_line` [rad].
+        model: timing model of the workcell.
+        line: the line.
+        q: (PHASE_SAMPLES, joints) joint positions from `follow_line` [rad].
     """
     unit = rest_to_rest_profile(1.0, PHASE_SAMPLES)
     box, *targets = line.at(unit.value)
@@ -281,7 +287,7 @@ def time_line(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
 
 
 def standing_still(motion: PhaseMotion, sample: int, time: Array) -> PhaseMotion:
-    """Repeat the state of a motion at one sample, at times (n,) [s]."""
+    """Return a motion that stays in the state of one sample of `motion`, at times (n,) [s]."""
     arrays = {
         name: np.repeat(values[sample][None], len(time), axis=0)
         for name, values in vars(motion).items()
@@ -292,7 +298,8 @@ def standing_still(motion: PhaseMotion, sample: int, time: Array) -> PhaseMotion
 
 
 def carry_motion(model: TimingModel, carry: Carry) -> PhaseMotion:
-    """Return the carry's timed motion, then rest until a whole number of ticks is over."""
+    """Return the timed motion of a carry, followed by rest until a whole number of ticks has
+    passed."""
     q, pose = np.ascontiguousarray(carry.q), np.ascontiguousarray(carry.pose)
     time = carry.time - carry.time[0]
     motion = PhaseMotion(
@@ -320,7 +327,7 @@ def carry_motion(model: TimingModel, carry: Carry) -> PhaseMotion:
 
 
 USE_TOLERANCE = 1.005
-"""Use of a limit beyond which a job is refused."""
+"""A job is refused if a limit is used beyond this ratio."""
 
 _FORCE_FLOOR = 1e-9
 
@@ -332,8 +339,10 @@ _NO_JUMP = 1e-6
 def holding(
     model: TimingModel, settings: SqueezeSettings, motions: Sequence[PhaseMotion]
 ) -> tuple[list[Force], Squeeze]:
-    """Compute the forces of consecutive phases that hold the box, and the squeeze that they follow
-    from.
+    """Compute the forces of consecutive phases in which the box is held.
+
+    Returns:
+        Forces of each phase, and how the commanded forces came about.
 
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
@@ -361,15 +370,15 @@ def holding(
 def pressing(
     motion: PhaseMotion, hold: Force, sample: int, rate: float
 ) -> tuple[PhaseMotion, Force]:
-    """Compute forces that rise from zero to those of one sample, or fall for the last, while
-    everything stands still.
+    """Compute a phase in which forces rise from zero, or fall to zero, while box and arms stand
+    still.
 
-    The weight of the box passes from its support to the arms with the same profile, so that
-    friction is never used more than while the box is held.
+    The weight of the box passes between its support and the arms with the same profile, so friction
+    is never used more than while the box is held.
 
     Args:
-        motion, hold: motion and forces of the phase that follows or precedes.
-        sample: 0 for the beginning of that phase, -1 for its end.
+        motion, hold: motion and forces of the phase that follows (rise) or precedes (fall).
+        sample: 0 for a rise to the first sample of that phase, -1 for a fall from its last sample.
         rate: largest rate of a normal force [N/s].
     """
     peak = float(hold.normal[sample].max())
@@ -384,11 +393,12 @@ def pressing(
 
 
 def waiting(motion: PhaseMotion, sample: int, duration: float) -> tuple[PhaseMotion, Force]:
-    """Stand still at one sample of a motion while hands take hold or let go, without forces.
+    """Compute a phase without forces in which the arms stand still while hands take hold or let go.
 
     Args:
-        sample: 0 for the first sample of the motion, -1 for the last.
-        duration: least duration of the standstill [s].
+        motion: motion of the neighbouring phase.
+        sample: 0 to stand at the first sample of this motion, -1 at the last.
+        duration: least duration of the phase [s].
     """
     time = np.linspace(0.0, at_even_steps(duration, TICK), PHASE_SAMPLES)
     still = standing_still(motion, sample, time)
@@ -402,16 +412,17 @@ def zero_forces(motion: PhaseMotion) -> Force:
 
 
 def unit_squeeze(workcell: Workcell, pose: Array, leader: int = 0) -> Array:
-    """Compute the wrenches (n, 2, 6) about the nominal contact points of 1 N commanded beyond the
-    plan.
+    """Compute the change (n, 2, 6) of both robots' wrenches on the box per newton of additional
+    commanded force, about the nominal contact points [N, N m].
 
-    Of pads with opposite normals both forces act on one line, midway between the nominal points,
-    and cancel. Of others it is an internal squeeze within all friction cones. Hands that hold by
-    themselves exert none.
+    For pads with opposite normals both forces act on one line, midway between the nominal points,
+    and cancel. For other pads the change is an internal squeeze within all friction cones. For
+    hands that grip the box without a squeeze it is zero.
 
     Args:
-        pose: (n, 6) of the box [m, rad].
-        leader: index of the arm that is not commanded.
+        workcell: the workcell.
+        pose: (n, 6) box poses [m, rad].
+        leader: index of the position-controlled arm.
     """
     if not contact_model(workcell).is_squeeze:
         return np.zeros((len(pose), 2, 6))
@@ -440,11 +451,17 @@ def unit_squeeze(workcell: Workcell, pose: Array, leader: int = 0) -> Array:
 def phase_use(
     workcell: Workcell, motion: PhaseMotion, force: Force, jerk: JerkLimits | None = None
 ) -> dict[str, float]:
-    """Compute the largest value over its limit, by constraint, of the quantities that every phase
-    has.
+    """Compute the utilisation of limits that apply to every phase: largest value over its limit, by
+    name.
 
-    Torques are those of arms and commanded contact wrenches together. Friction and pressure are
-    judged where forces are planned (`hybrid_opt.timing`): pressing harder only helps them.
+    Torques are the sum of the arms' own and those of the commanded contact wrenches. Friction and
+    pressure are not among them: the timing checks them with the planned forces, and pressing harder
+    only improves them.
+
+    Args:
+        workcell: the workcell.
+        motion, force: motion and forces of the phase.
+        jerk: jerk limits; None for none.
     """
 
     effort = motion.own_torque + motion.contact_effort(force.wrench)
@@ -469,7 +486,7 @@ def phase_use(
 
 def joint_use(workcell: Workcell, q: Array, rate: Array, second: Array) -> dict[str, float]:
     """Compute the largest position, velocity and acceleration of joints (n, joints) over their
-    limits."""
+    limits, by name."""
     lower, upper = map(workcell.stack_joint_limits, ("position_lower", "position_upper"))
     return {
         "joint position": _most(np.abs(2.0 * q - lower - upper) / (upper - lower)),
@@ -481,7 +498,7 @@ def joint_use(workcell: Workcell, q: Array, rate: Array, second: Array) -> dict[
 
 
 def _jerk(time: Array, second: Array) -> Array:
-    """Compute the magnitudes (n - 1, k) of the change of accelerations (n, k) per time; infinite at
+    """Compute the magnitudes (n - 1, k) of the rate of change of accelerations (n, k); infinite at
     jumps."""
     steps, change = np.diff(time)[:, None], np.abs(np.diff(second, axis=0))
     jumps = np.where(change > _NO_JUMP, np.inf, 0.0)

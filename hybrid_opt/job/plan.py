@@ -5,11 +5,10 @@ press, lift it off, carry it, set it down, let go, and retreat. Hands that hold 
 hold before they take over the weight (`ContactModel.closing`). Every phase but the carry follows a
 smooth profile from rest to rest (`hybrid_opt.job.motions`).
 
-Contact rules. A body of an arm's last link that lies behind the plane of its pad may touch the box:
-at the grasp, and wherever the pad is moved away from it along the contact normal, that plane
-separates both. Every other body of an arm has to stay clear of the box, also those that a grasp
-keeps apart. The box may touch the bodies that it stands on until it is lifted off, and sink into
-them by no more than `RESTING_TOLERANCE`.
+Contact rules. A body of an arm's last link that lies behind the plane of the pad is not checked
+against the box: the plane separates both at the grasp, and wherever the pad is withdrawn along the
+contact normal. Every other body of an arm has to stay clear of the box. The box may touch the
+bodies that it stands on until it is lifted, and penetrate them by at most `RESTING_TOLERANCE`.
 """
 
 from __future__ import annotations
@@ -60,16 +59,17 @@ from symbolic.records import PAYLOAD_NAME, AllowedContact, Handling, Waypoint, W
 from symbolic.records.task import extended_waypoints
 
 LARGEST_DROP = 0.3
-"""How far below the carry's ends something to stand on is looked for [m]."""
+"""Largest distance below the carry's ends within which a support of the box is looked for [m]."""
 
 MOST_STEPS = 300
 BEHIND_PAD = "behind the pad: the contact plane keeps them apart"
 
 SAME_PLANE = 1e-9
-"""Cosine with a normal above which an approach does not pass the pad's plane."""
+"""An approach does not cross the plane of a pad if its cosine with the pad's normal is above the
+negative of this."""
 
 CHECK_STRIDE = 10
-"""Stride of the samples of a straight motion that are judged."""
+"""Every so many samples of a straight motion are checked for collisions."""
 
 
 @dataclass(frozen=True)
@@ -127,17 +127,19 @@ class StraightMotions:
 
 
 class JobCollisions:
-    """The collision model of one workcell's jobs. Not to be shared between threads.
+    """The collision model of one workcell's jobs. Threads must not share one.
 
     Attributes:
-        geometry: bodies and pairs to check: those of the carry, and each arm's bodies with the box.
+        geometry: bodies and pairs to check: the pairs of the carry, and each arm's bodies against
+            the box.
     """
 
     def __init__(self, compiled: CompiledCell, everywhere: bool = False) -> None:
         """Load or build the compiled bounds.
 
         Args:
-            everywhere: whether the pads may come from anywhere; else along their contact normals.
+            everywhere: True if pads may approach from any direction, False if along their contact
+                normals.
 
         Raises:
             DualArmError: the model cannot be built.
@@ -186,7 +188,12 @@ class JobCollisions:
         return SupportedPose(_lowered(pose, found), found, tuple(names))
 
     def straight_motions(self, handling: Handling, pose: Array) -> StraightMotions:
-        """Plan the straight motions around a carry from the first to the second pose (2, 6)."""
+        """Plan the straight motions before and after a carry.
+
+        Args:
+            handling: heights, speeds and stand-off of the job.
+            pose: (2, 6) box poses at the beginning and end of the carry [m, rad].
+        """
         heights = (handling.lift_height, handling.set_down_height)
         before, after = (self.standing(*each) for each in zip(pose, heights, strict=True))
         stands = (before.pose, after.pose)
@@ -195,7 +202,8 @@ class JobCollisions:
         return StraightMotions(checker, lines, (before.bodies, after.bodies))
 
     def checker(self, places: Sequence[SupportedPose]) -> CollisionChecker:
-        """Build the collision checker of a job; the box may touch its supports at these places.
+        """Build the collision checker of a job in which the box may touch its supports at the given
+        places.
 
         Args:
             places: supported poses of the box before and after the carry.
@@ -249,8 +257,8 @@ def job_geometry(workcell: Workcell, everywhere: bool = False) -> CellGeometry:
 
 
 def _behind_pad(body: CollisionBody, geometry: CellGeometry) -> bool:
-    """Return True if a body moves with its arm's pads and lies behind the plane of one of them, in
-    which or from which the arm approaches."""
+    """Return True if a body moves with the pads of an arm and lies behind the plane of one of them,
+    which the approach does not cross."""
     arm, workcell = body.frame.robot, geometry.workcell
     if arm < 0 or body.frame.joint != len(geometry.arms[arm].axes) - 1:
         return False
@@ -304,32 +312,32 @@ def describe_obstruction(
 
 
 PATH_SAMPLES = 201
-"""Samples of the carry's joints; Newton's method reaches every place between them."""
+"""Number of samples of the carry's joints; Newton's method reaches every place between them."""
 
 _SAME_POSTURE = 7
-"""Decimals of joint positions [rad, m] within which carries end in the same posture."""
+"""Carries end in the same posture if their joint positions agree to so many decimals [rad, m]."""
 
 _MOST_KNOWN = 8
-"""Different ends of carries whose handling is remembered."""
+"""Number of different carry ends whose straight motions are cached."""
 
 FIRST_POINTS = 11
-"""Grid that the proof of a straight motion starts from."""
+"""Number of grid points at which the certification of a straight motion starts."""
 
 
 class JobModel:
-    """Plans the jobs of one workcell. Not to be shared between threads.
+    """Planner of the jobs of one workcell. Threads must not share one.
 
     Attributes:
         workcell: the cell.
-        timing: its timing model.
+        timing: timing model of the workcell.
     """
 
     def __init__(self, cell: Workcell | CompiledCell, timing: TimingModel | None = None) -> None:
         """Load or build the compiled functions.
 
         Args:
-            cell: compiled, where others share its functions.
-            timing: its timing model, where there is one.
+            cell: the workcell; give a compiled one to share its functions.
+            timing: timing model of the workcell; built if None.
 
         Raises:
             DualArmError: the model cannot be built.
@@ -413,8 +421,8 @@ class JobModel:
     def _around(
         self, carry: Carry, handling: Handling
     ) -> tuple[StraightMotions, list[Phase], list[Phase]]:
-        """Plan the moving phases before a carry and after it, either from the carry outwards;
-        cached for carries with the same ends."""
+        """Plan the moving phases before and after a carry, each list ordered from the carry
+        outwards. Results are cached for carries with the same ends."""
         pose, q = carry.pose[[0, -1]], carry.q[[0, -1]].round(_SAME_POSTURE)
         key = handling, pose.tobytes() + q.tobytes()
         if key in self._known:
@@ -431,7 +439,7 @@ class JobModel:
         return self._known[key]
 
     def _proof(self, checker: CollisionChecker, carry: Carry) -> Certificate:
-        """Certify the carry between its samples."""
+        """Certify that a carry is free of collisions throughout."""
         u = np.linspace(0.0, 1.0, PATH_SAMPLES)
         q = interpolated(u, carry.parameter, carry.q)
         task = self.workcell.task
@@ -439,7 +447,7 @@ class JobModel:
         return certificates(checker, self._posture, [path])[0]
 
     def _free(self, checker: CollisionChecker, line: Straight, motion: PhaseMotion) -> Certificate:
-        """Certify a straight motion between its samples."""
+        """Certify that a straight motion is free of collisions throughout."""
         share = rest_to_rest_profile(1.0, PHASE_SAMPLES).value
 
         def at(u: Array) -> tuple[Array, Array, Array]:
@@ -452,7 +460,11 @@ class JobModel:
     def _phases(
         self, drafts: Sequence[Phase], timing: Timing, jerk: JerkLimits | None
     ) -> Iterator[Phase]:
-        """Yield the phases in order, with their uses; raise if one collides or exceeds a limit."""
+        """Yield the phases in order of time, with their utilisations.
+
+        Raises:
+            JobError: a phase collides or exceeds a limit.
+        """
         begin, contact = 0.0, contact_model(self.workcell)
         for draft in drafts:
             # Jumps that a carry is to keep are reported elsewhere.
@@ -494,7 +506,7 @@ class CommandedForces:
 
     Attributes:
         forces: (n, 2) normal forces to command along the carry [N].
-        squeeze: origin of the forces.
+        squeeze: how the forces came about.
         job: the whole job around the carry; None if no job can be planned. The forces are then
             computed for the carry alone.
         problem: reason why no job can be planned, else ''.
@@ -536,11 +548,11 @@ _model = cache_by_workcell(JobModel)
 
 
 class HasTiming(Protocol):
-    """An object that knows its carry's timing, such as a recommendation."""
+    """An object with the timing of a carry, such as a recommendation."""
 
     @property
     def timing(self) -> Timing:
-        """The timing as robots drive it."""
+        """Timing of the carry as robots drive it."""
 
 
 def plan_job(

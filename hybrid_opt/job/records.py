@@ -1,5 +1,5 @@
-"""A whole job, from the approach of the pads to their retreat; and its samples at even time steps,
-as robot controllers take it."""
+"""Records of a whole job, from the approach of the pads to their retreat, and its samples at even
+time steps, as robot controllers need them."""
 
 from __future__ import annotations
 
@@ -21,33 +21,36 @@ from symbolic.errors import SettingsError
 from symbolic.records import Workcell
 
 PHASES = ("approach", "press", "lift", "carry", "set_down", "release", "retreat")
-"""Every phase of a job of pads in order; without a height there is no lift or no set-down. Of hands
-that hold by themselves, `ContactModel.closing` and `opening` stand for press and release."""
+"""Names of the phases of a job of pads, in order. If the box is not lifted or lowered, there is no
+lift or no set-down. For gripping hands, `ContactModel.closing` and `opening` replace press and
+release."""
 
 SWITCHES = {"grip_on": True, "grip_off": False}
-"""Phases at whose beginning the outputs of hands are switched, and what to; at their end the inputs
-have to say the same."""
+"""Phases at whose beginning the outputs of hands are switched, with the new state. At the end of
+the phase the inputs of the hands have to show this state."""
 
 HELD_PHASES = ("lift", "carry", "set_down")
-"""Phases in which the box is held and moves."""
+"""Names of the phases in which the box is held and moves."""
 
 _STATIC = ("friction", "path speed", "joint position", "least normal force")
-"""Uses that say nothing of how hard a phase drives the cell."""
+"""Names of utilisations that are not considered for the most used limit of a phase."""
 
 LEAST_STEP = 1e-3
 
 LARGEST_STEP = 1.0
-"""Range of the time step [s]."""
+"""Largest time step of a sampled job [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class PhaseMotion:
-    """Motion of box and arms in a phase at n samples; world frame, both arms' joints stacked.
+    """Motion of box and arms in a phase at n samples, in the world frame. Joints of both arms are
+    stacked.
 
-    Where an acceleration jumps, the sample stands twice: with the value before and after the jump.
+    At a jump of an acceleration there are two samples of the same time, with the values before and
+    after the jump.
 
     Attributes:
-        first: number of the first arm's joints.
+        first: number of joints of the first arm.
         time: (n,) from the beginning of the phase [s].
         pose, rate, second_rate: (n, 6) box pose [m, rad] and its time derivatives.
         q, q_rate, q_second: (n, joints) joint positions [rad] and their time derivatives.
@@ -73,17 +76,18 @@ class PhaseMotion:
         return float(self.time[-1])
 
     def contact_effort(self, wrench: Array) -> Array:
-        """Compute the joint torques (n, joints) that exert wrenches (n, 2, 6) on the box [N m]."""
+        """Compute the joint torques (n, joints) [N m] that exert wrenches (n, 2, 6) of both robots
+        on the box."""
         return contact_torque(self.first, self.wrench_torque, np.swapaxes(wrench, 0, 1))
 
 
 @dataclass(frozen=True, eq=False)
 class Force:
-    """Forces of the robots in a phase at n samples, world frame.
+    """Forces of the robots in a phase at n samples, in the world frame.
 
     Attributes:
         normal: (n, 2) commanded normal force of each robot [N].
-        least: (n, 2) least normal force that holds the box, the planned one [N].
+        least: (n, 2) planned normal force, the least that holds the box [N].
         wrench: (n, 2, 6) wrench of each robot on the box about the robot's nominal contact point,
             with the commanded normal forces [N, N m].
     """
@@ -99,12 +103,11 @@ class Phase:
 
     Attributes:
         name: one of `PHASES`, or the name of a phase that the contact model adds.
-        begin: time from the beginning of the job to that of the phase [s].
+        begin: time at which the phase begins, from the beginning of the job [s].
         motion: motion of box and arms in the phase.
         force: forces of the robots in the phase.
         certificate: verdict on collisions along the whole path of the phase.
-        use: by name of a constraint, the largest ratio of value to limit, with the commanded
-            forces.
+        use: largest ratio of value to limit with the commanded forces, by name of the limit.
     """
 
     name: str
@@ -121,7 +124,7 @@ class Phase:
 
     @property
     def most_used(self) -> str:
-        """Name of the constraint with the largest use, without those of `_STATIC`."""
+        """Name of the limit with the largest utilisation, limits of `_STATIC` excluded."""
         use = {name: ratio for name, ratio in self.use.items() if name not in _STATIC}
         return max(use, key=lambda name: use[name])
 
@@ -143,9 +146,9 @@ class Job(Displayable):
         workcell: the cell.
         timing: timing of the carry.
         phases: phases of the job in order of time.
-        squeeze: origin of the commanded normal forces.
-        stands_on: names of the bodies that support the box before and after the job, two tuples; a
-            tuple is empty where the box is handed over in the air.
+        squeeze: how the commanded normal forces came about.
+        stands_on: names of the bodies that support the box before and after the job, two tuples;
+            empty if the box is handed over in the air.
         joint_names: names of each arm's joints, two tuples.
     """
 
@@ -172,12 +175,12 @@ class Job(Displayable):
 
     @property
     def follower(self) -> int | None:
-        """Index of the force-controlled arm; None where hands grip the box without a squeeze."""
+        """Index of the force-controlled arm; None if hands grip the box without a squeeze."""
         return 1 - self.squeeze.leader if contact_model(self.workcell).is_squeeze else None
 
     @property
     def control(self) -> str:
-        """Sentence on which arm is force-controlled while the box is held."""
+        """Sentence that says which arm is force controlled while the box is held."""
         if self.follower is None:
             return "both arms keep their places"
         return f"robot {self.workcell.robots[self.follower].name!r} is force-controlled"
@@ -213,9 +216,9 @@ class Job(Displayable):
 
 @dataclass(frozen=True, eq=False)
 class SampledJob:
-    """A job at n samples; both arms' joints side by side, world frame, read-only.
+    """A job at n samples, in the world frame, read-only. Joints of both arms are side by side.
 
-    Two successive phases share one sample, the last of the earlier phase.
+    The last sample of a phase is also the first of the next phase.
 
     Attributes:
         job: the job.
@@ -223,7 +226,7 @@ class SampledJob:
         last: index of the last sample of each phase.
         pose: (n, 6) box poses [m, rad].
         q, q_rate, q_second: (n, joints) joint positions [rad] and their time derivatives.
-        effort: (n, joints) joint torques of motion, weight and commanded wrenches [N m].
+        effort: (n, joints) joint torques of the arms' motion, weight and commanded wrenches [N m].
         normal_force: (n, 2) commanded normal force of each robot [N].
         wrench: (n, 2, 6) wrench of each robot on the box about the robot's nominal contact point
             [N, N m].
@@ -249,7 +252,8 @@ class SampledJob:
 
     @property
     def phase_names(self) -> tuple[str, ...]:
-        """Name of the phase of each sample (n,); a shared sample counts to the earlier phase."""
+        """Name of the phase of each sample (n,). A sample shared by two phases counts to the
+        earlier one."""
         names: list[str] = []
         for phase, last in zip(self.job.phases, self.last, strict=True):
             names += [phase.name] * (last + 1 - len(names))
@@ -265,10 +269,10 @@ def sample_job(job: Job, step: float) -> SampledJob:
     """Sample a job at even time steps within each phase, from time 0.
 
     Joints and box follow cubic Hermite pieces between the job's own samples, which are denser than
-    any sensible step; accelerations, torques and forces are interpolated linearly.
+    usual steps. Accelerations, torques and forces are interpolated linearly.
 
     Args:
-        step: time between samples [s]; it is shrunk so that whole steps fill each phase.
+        step: time between samples [s], reduced such that whole steps fill each phase.
 
     Raises:
         SettingsError: the step is out of range.

@@ -1,10 +1,11 @@
 """Smoothing of a timing with jumps of the acceleration.
 
-Time-optimal timings switch accelerations in no time, and begin and end with one. No controller
-follows that. Here the path parameter as a function of time, u(t), is averaged over a short window
-with a smooth kernel: box and arms stay on the very same path, begin and end at rest also in their
-accelerations, and the jerk is bounded by the jumps over the width. Where a limit is then exceeded,
-since speeds are passed a little earlier or later, the motion is slowed down uniformly.
+Time-optimal timings switch accelerations instantaneously, and begin and end with an acceleration.
+No controller can follow that. Here the path parameter as a function of time, u(t), is averaged over
+a short window with a smooth kernel. Box and arms stay on exactly the same path, begin and end at
+rest without acceleration, and the jerk is bounded by the jumps over the width. Speeds are reached a
+little earlier or later than before; if a limit is then exceeded, the motion is slowed down
+uniformly.
 """
 
 from __future__ import annotations
@@ -25,28 +26,28 @@ SMOOTHING_WIDTH = 0.05
 """Half the width of the window [s]."""
 
 LARGEST_WIDTH = 1.0
-"""Largest width that may be asked for [s]."""
+"""Largest allowed width [s]."""
 
 AVERAGING_STEP = 5e-4
 """Time step of the averaging [s]."""
 
 STEPS_PER_SAMPLE = 4
-"""Steps of the averaging between two samples of the carry."""
+"""Number of averaging steps between two samples of the carry."""
 
 RESTS = 1e-3
-"""Share of an acceleration limit below which a joint counts as at rest."""
+"""A joint begins or ends at rest if its acceleration there is below this share of its limit."""
 
 _SLOWER = (0.95, 0.5)
-"""Factors tried as the lower end of the search for one, the mildest first."""
+"""Factors that are tried as the lower end of the search for the slowdown, the mildest first."""
 
 _RESOLUTION = 1e-4
 """Resolution of the factor by which a timing is slowed."""
 
 _UNUSED = 1e-4
-"""Share of the limit used most that may be left unused."""
+"""Share of the most used limit that may be left unused."""
 
 _INSIDE = 0.01
-"""Share of an interval of factors that is kept from its ends."""
+"""Guesses of the factor keep this share of the interval away from its ends."""
 
 
 def has_rest_at_ends(timing: Timing) -> bool:
@@ -55,7 +56,8 @@ def has_rest_at_ends(timing: Timing) -> bool:
 
 
 def acceleration_at_ends(timing: Timing) -> float:
-    """Compute the largest acceleration of a joint at either end, over its limit."""
+    """Compute the largest joint acceleration over its limit at the beginning and end of a
+    timing."""
     carry = timing.driven
     limit = carry.workcell.stack_joint_limits("acceleration_max")
     return float((np.abs(carry.stack_arms("q_second")[[0, -1]]) / limit).max())
@@ -64,18 +66,18 @@ def acceleration_at_ends(timing: Timing) -> float:
 def without_jumps(
     model: TimingModel, timing: Timing, jerk: JerkLimits | None, width: float = SMOOTHING_WIDTH
 ) -> Timing:
-    """Compute a timing of the same path within the same limits without jumps of the acceleration,
-    as jobs need it.
+    """Compute a timing of the same path within the same limits, without jumps of the acceleration.
+    Jobs need such a timing.
 
     Args:
-        model: of the timing's workcell.
-        timing: one that robots can drive, with its speeds on the grid.
-        jerk: limits to keep in place of averaging; None where there are none.
-        width: half the width of the window [s]; zero leaves jumps as they are.
+        model: timing model of the workcell.
+        timing: drivable timing with path speeds on the grid.
+        jerk: jerk limits to satisfy; None to average the timing instead.
+        width: half the width of the averaging window [s]; zero keeps the jumps.
 
     Raises:
-        JobError: slowing down by half does not bring it within its limits, or those on jerk cannot
-            be kept.
+        JobError: slowing down to half speed does not satisfy the limits, or the jerk limits cannot
+            be satisfied.
     """
     if width == 0.0 or has_rest_at_ends(timing):
         return timing
@@ -88,19 +90,21 @@ def without_jumps(
 
 
 def driven_limits(model: TimingModel, x: Array) -> TimingLimits:
-    """Return the limits of a job's carry x (n_var,): its own force limit if its time law has one,
-    else the reference speeds."""
+    """Return the timing limits of a job's carry x (n_var,): its own force limit if the time law is
+    drivable, else the reference speeds."""
     if model.workcell.task.law.is_drivable:
         return model.drive_limits(float(x[-1]))
     return TimingLimits(reference_speed=True)
 
 
 def driven_timing(model: TimingModel, x: Array) -> Timing:
-    """Compute the timing of a job's carry x (n_var,): as fast as `driven_limits` and all others
-    allow, without jumps of acceleration.
+    """Compute the fastest timing of a job's carry x (n_var,) within `driven_limits` and the
+    workcell's limits, without jumps of acceleration. If the path has no timing, the result states
+    why.
 
     Raises:
-        JobError: as of `without_jumps`.
+        JobError: slowing down to half speed does not satisfy the limits, or the jerk limits cannot
+            be satisfied.
     """
     limits = driven_limits(model, x)
     timing = time_path(model, x, limits)
@@ -112,7 +116,7 @@ def driven_timing(model: TimingModel, x: Array) -> Timing:
 
 
 def _smoothed(model: TimingModel, timing: Timing, width: float) -> Timing:
-    """Average the timing over a window, within the limits of its solution."""
+    """Average a timing over a window, and slow it down until it satisfies its limits."""
     u, rate, second = _averaged(timing.grid_speed, width)
     motion = model.path_motion(timing.driven.x).interpolate(u)
     limits = timing.limits
@@ -140,8 +144,8 @@ def _smoothed(model: TimingModel, timing: Timing, width: float) -> Timing:
 
 @dataclass(frozen=True)
 class _Slowdown:
-    """A timing slowed by a factor: its excess over limits, and every use except that of friction,
-    which is tight by construction."""
+    """A timing slowed by a factor, with its excess over limits and all ratios except friction,
+    which is fully used by construction."""
 
     factor: float
     timing: Timing
@@ -150,10 +154,10 @@ class _Slowdown:
 
 
 def _fastest(driven: Callable[[float], _Slowdown]) -> _Slowdown:
-    """Find the motion with the largest factor up to 1 that stays within the limits.
+    """Find the motion with the largest factor up to 1 that satisfies the limits.
 
     Raises:
-        JobError: none does that is not below half.
+        JobError: even the factor 0.5 does not satisfy the limits.
     """
     fast = driven(1.0)
     if fast.excess <= 0.0:
@@ -177,10 +181,11 @@ def _fastest(driven: Callable[[float], _Slowdown]) -> _Slowdown:
 
 
 def _between(slow: _Slowdown, fast: _Slowdown) -> float:
-    """Interpolate a factor between two at which the limit exceeded with one of them is used fully.
+    """Interpolate between two factors to the one at which the most exceeded limit is just fully
+    used.
 
-    Accelerations, forces and torques are nearly affine in the factor's square, so that hardly more
-    than one guess is needed.
+    Accelerations, forces and torques are nearly affine in the square of the factor, so one guess is
+    nearly enough.
     """
     low, high, least = slow.columns, fast.columns, 1.0 - _UNUSED / 2.0
     beyond = (high > least) & (high > low)
@@ -191,7 +196,7 @@ def _between(slow: _Slowdown, fast: _Slowdown) -> float:
 
 
 def _averaged(grid_speed: Array, width: float) -> tuple[Array, Array, Array]:
-    """Compute u, u' and u'' of the averaged timing at every `STEPS_PER_SAMPLE`th step."""
+    """Compute u, u' and u'' of the averaged timing, one sample every `STEPS_PER_SAMPLE` steps."""
     intervals = len(grid_speed) - 1
     grid = np.linspace(0.0, 1.0, intervals + 1)
     steps = 2.0 * np.diff(grid) / (grid_speed[:-1] + grid_speed[1:])

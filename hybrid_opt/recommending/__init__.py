@@ -1,6 +1,6 @@
 """The carry to run: chosen from a drivable front, compared with the hand-made one, explained.
 
-choice: every path as options of a duration and a force to command, and the best of them for a
-wish. advice: margins at the commanded force, and what changes of the cell would change.
-recommendation: all of it as one record, with the job, and other paths at the same force.
+choice: every path as options, each with a duration and a commanded force, and the best options for
+a wish. advice: margins at the commanded force, and effects of changes of the cell. recommendation:
+one record with all of it, with the job, and with other paths at the same force.
 """

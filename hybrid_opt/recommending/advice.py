@@ -1,8 +1,8 @@
 """Margins of the cell's description at the commanded force, and effects of changes of the cell.
 
-The commanded force is that of the worst case at the sample with the largest force. The effect of a
-small change of the cell on it is a derivative, by differences. The duration that a change of force
-is worth follows from timings of the path within other limits of the force.
+The commanded force is the force of the worst case at the sample that needs most. The effect of a
+change of the cell on it is a difference of two forces. It is converted to a duration by timings of
+the path within other force limits.
 """
 
 from __future__ import annotations
@@ -34,25 +34,25 @@ FRICTION_CHANGE = 0.05
 DEGREE_CHANGE = np.pi / 180.0
 
 PITCH = 4
-"""Index of the pitch among the numbers of a pose."""
+"""Index of the pitch in a pose."""
 
 FORCE_MULTIPLES = 1.0 + np.array([-0.02, 0.0, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8])
 """Multiples of the force limit at which the path's duration is computed."""
 
 LOOKED_AT = 8
-"""Samples of largest commanded force at which small changes are judged."""
+"""Number of samples of largest commanded force at which the effects of changes are computed."""
 
 LARGEST_SIDE_COSINE = 0.5
-"""Largest cosine between upwards and the normal of a contact at a side of the payload, along which
-a contact can be moved up or down."""
+"""A contact counts as at a side of the payload, where it can be moved up or down, if the cosine
+between its normal and the upward direction is smaller."""
 
 LEAST_HEIGHT = 2e-3
-"""Height of the pads over the centre of mass above which the advice mentions it [m]."""
+"""The advice mentions the height of the pads over the centre of mass if it exceeds this [m]."""
 
 
 @dataclass(frozen=True)
 class Advice:
-    """Effect of one change of the cell or of one via-point, the path kept otherwise.
+    """Effect of one change of the cell or of one via-point on a carry with the same path otherwise.
 
     Attributes:
         change: the changed quantity with the size of its change.
@@ -69,7 +69,8 @@ class Advice:
 
 
 def commanded_margins(carry: Carry, forces: Array) -> tuple[Margin, ...]:
-    """Compute the largest deviation of each quantity at which the commanded forces hold the carry.
+    """Compute the largest deviation of each quantity of the cell at which the commanded forces
+    still hold the box along a carry.
 
     The quantities are friction, mass and centre of mass. Only one deviates at a time.
 
@@ -82,7 +83,8 @@ def commanded_margins(carry: Carry, forces: Array) -> tuple[Margin, ...]:
     enough, nominal = forces[rows, 1 - LEADER] * (1.0 + HOLDS), nominal_case(workcell)
 
     def last(change: Array, end: float) -> tuple[float, str]:
-        """Find the largest multiple of a change up to which the forces hold, which rise with it."""
+        """Find the largest multiple of a change, up to `end`, at which the forces still hold the
+        box, and the failure beyond it. The needed forces rise with the change."""
         low, high = 0.0, end
         for step in range(MARGIN_BISECTIONS):
             middle = end if step == 0 else (low + high) / 2.0
@@ -118,7 +120,14 @@ def commanded_margins(carry: Carry, forces: Array) -> tuple[Margin, ...]:
 
 
 def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tuple[Advice, ...]:
-    """Compute effects of changes of the cell on a carry, the largest decrease of force first."""
+    """Compute the effects of changes of the cell on a carry, the largest decrease of force first.
+
+    Args:
+        cell: the drivable cell.
+        paths: paths of the front.
+        option: option of the recommended carry.
+        timing: timing of the recommended carry.
+    """
     assert timing.carry is not None, "what is driven has a carry"
     # With less the path may have no timing: a tilted box needs more than a level one.
     limits = np.minimum(
@@ -133,7 +142,7 @@ def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tu
         slope = float((durations[high] - durations[low]) / (forces[high] - forces[low]))
 
     def in_time(force: float) -> float:
-        """Convert a change of the force to command to a change of duration at the same force
+        """Convert a change of the commanded force [N] to the change of duration at the same force
         [s]."""
         spare = float(np.interp(option.commanded - force, forces, durations))
         lost = max(forces[0] - (option.commanded - force), 0.0)
@@ -148,8 +157,8 @@ def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tu
 
 
 def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str, float]]:
-    """Yield changes of the cell, and the rise of the largest force to command along a motion
-    [N]."""
+    """Yield changes of the cell by name, each with the rise of the largest commanded force along a
+    motion [N]."""
     doubt = workcell.uncertainty
 
     def needed(cell: Workcell, motion: BoxMotion) -> Array:
@@ -179,8 +188,8 @@ def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str
 
 
 def _height(workcell: Workcell) -> tuple[Array, float]:
-    """Compute the upward direction (3,) in the box frame at the start, and the height of the middle
-    of both robots' pads over the centre of mass [m]."""
+    """Compute the upward direction (3,) in the box frame at the start, and the height [m] of the
+    pads over the centre of mass, as the mean of both robots."""
     pose = workcell.task.waypoints[0].lower
     up: Array = box_rotation(workcell.task.orientation, pose)[2]
     middles = [
@@ -191,7 +200,7 @@ def _height(workcell: Workcell) -> tuple[Array, float]:
 
 
 def _with_pads(workcell: Workcell, change: Callable[[Contact], Contact]) -> Workcell:
-    """Return the cell with every pad changed."""
+    """Return the cell with `change` applied to every pad."""
     first, second = (
         replace(change(contact), further=tuple(change(pad) for pad in contact.further))
         for contact in workcell.contacts
@@ -204,7 +213,7 @@ def _with_friction(pad: Contact) -> Contact:
 
 
 def _moved(pad: Contact, by: Array) -> Contact:
-    """Move a pad by (3,) in the box frame [m], projected onto its face."""
+    """Move a pad by a vector `by` (3,) in the box frame [m], projected onto the pad's face."""
     T, normal = pad.T_box_pad.copy(), pad.T_box_pad[:3, 2]
     T[:3, 3] += by - (by @ normal) * normal
     return replace(pad, T_box_pad=T)
@@ -218,8 +227,8 @@ def _wider(pad: Contact) -> Contact:
 
 
 def _of_pitch(cell: Cell, path: Array, option: Option, slope: float) -> Iterator[Advice]:
-    """Yield the effect of one more degree of pitch at every via-point, in the better direction, if
-    nothing is in the way."""
+    """Yield the effect of one degree more pitch at each via-point, in the direction that shortens
+    the carry. Positions without a feasible carry are left out."""
     if slope == 0.0:
         return
     task, varied, names = cell.workcell.task, [], []

@@ -1,8 +1,8 @@
-"""The carry that a wish names among the paths of a drivable front.
+"""Choice of a carry for a wish among the paths of a drivable front.
 
-Every path is driven within several limits of the planned force. Each is an option: how long the
-carry takes, and how hard to press so that it holds in every case of the cell's uncertainty. Targets
-of wishes are about these two; a wish may also replace numbers of the cell.
+Every path is timed within several limits of the planned force. Each timing is an option: a duration
+of the carry, and a commanded force that holds the box in every case of the cell's uncertainty. The
+target of a wish is one of these two; a wish may also replace numbers of the cell.
 """
 
 from __future__ import annotations
@@ -29,15 +29,16 @@ from symbolic.records.cell import RANGES
 _UNITS = {"duration": "s", "force": "N", "payload": "kg", "reference_force": "N"}
 
 FORCES = 10
-"""Limits that every path is driven within at first, and by how much they are refined."""
+"""Number of force limits within which every path is timed at first. They are closer together where
+the force is small."""
 
 ROUNDS = 6
 
 LEAST_ABOVE_STILL = 1e-3
-"""Least limit, as a share above holding still."""
+"""The smallest force limit exceeds the force at rest by this share."""
 
 SAMPLES_PRESSED = 32
-"""Samples of largest planned force at which it is computed how hard to press."""
+"""Number of samples of largest planned force for which the commanded force is computed."""
 
 
 @dataclass(frozen=True)
@@ -47,12 +48,12 @@ class Wish:
     Without a duration or a force, the product of duration and commanded force is minimised.
 
     Attributes:
-        duration: longest allowed duration of the carry within limits on jerk [s]; the commanded
+        duration: longest allowed duration of the carry within the jerk limits [s]; the commanded
             force is then minimised.
         force: largest allowed commanded force [N]; the duration is then minimised.
         payload: mass of the payload in place of the cell's [kg]; the inertia grows in proportion.
         reference_force: reference force of both robots in place of the cell's [N].
-        uncertainty: uncertainty in place of the cell's.
+        uncertainty: uncertainty in place of the cell's; None keeps a value.
     """
 
     duration: float | None = None
@@ -62,10 +63,10 @@ class Wish:
     uncertainty: Uncertainty | None = None
 
     def __post_init__(self) -> None:
-        """Refuse two targets, and values that are not positive.
+        """Check the wish.
 
         Raises:
-            SettingsError: with the values.
+            SettingsError: both targets are given, or a value is not positive.
         """
         if self.duration is not None and self.force is not None:
             raise SettingsError("duration and force are wished for; give at most one of them")
@@ -77,7 +78,8 @@ class Wish:
 
     @property
     def numbers(self) -> dict[str, float]:
-        """Given numbers by name of their attribute; the uncertainty is not among them."""
+        """The numbers of the wish that are given, by name of their attribute. The uncertainty is
+        not among them."""
         values = {name: getattr(self, name) for name in _UNITS}
         return {name: value for name, value in values.items() if value is not None}
 
@@ -88,7 +90,7 @@ class Wish:
 
     @property
     def target(self) -> str:
-        """The target as a text."""
+        """The target of the wish as a text."""
         if self.duration is not None:
             return f"the least force of all carries of at most {self.duration:g} s"
         if self.force is not None:
@@ -141,7 +143,7 @@ def _listed(wish: Wish) -> str:
 
 @dataclass(frozen=True)
 class Goal:
-    """Limits of an option, and its cost.
+    """Limits that an option has to keep, and its cost.
 
     Attributes:
         longest: largest allowed duration [s].
@@ -155,7 +157,8 @@ class Goal:
 
     @classmethod
     def of(cls, wish: Wish, workcell: Workcell) -> Goal:
-        """Build the goal of a wish; robots never press beyond their reference forces."""
+        """Build the goal of a wish. Forces are limited by the robots' reference forces in any
+        case."""
         allowed, longest = workcell.task.reference_force, math.inf
         cost: Callable[[float, float], float] = operator.mul
         if wish.force is not None:
@@ -166,11 +169,11 @@ class Goal:
 
 
 def commanded_at_most(force: float, others: Array | float = np.inf) -> Array:
-    """Return the largest allowed forces (2,) [N] of both robots for a limit on the commanded force.
+    """Return the largest allowed forces (2,) [N] of both robots if the commanded force is limited.
 
     Args:
         force: largest commanded force of the force-controlled arm [N].
-        others: other limit of the forces, a number or one per robot (2,) [N].
+        others: further limit on the forces, one for both robots or one per robot (2,) [N].
     """
     found = np.broadcast_to(others, 2).astype(float)
     found[1 - LEADER] = min(found[1 - LEADER], force)
@@ -188,9 +191,9 @@ def force_alone(duration: float, force: float) -> float:
 
 
 class DrivenPaths:
-    """Paths of one cell with stored geometry, to be timed repeatedly within force limits.
+    """Paths of one cell with stored geometry, which can be timed repeatedly within force limits.
 
-    Timings keep the limits of the cell's drivable carries.
+    Timings satisfy all limits of the cell's drivable carries.
 
     Attributes:
         x: (k, n_path) decision vectors of the k paths without force limit.
@@ -199,7 +202,7 @@ class DrivenPaths:
     """
 
     def __init__(self, cell: Cell, x: Array) -> None:
-        """Compute the geometry of the paths."""
+        """Compute the geometry of the paths x (k, n_path) of a drivable cell."""
         self.x = np.atleast_2d(np.asarray(x, dtype=float))
         self._model = robust_model(cell.workcell)
         self.highest_force = cell.workcell.task.force_limit[1]
@@ -213,8 +216,15 @@ class DrivenPaths:
     def _driven(
         self, force: Array | float, rows: Sequence[int] | None = None
     ) -> list[tuple[int, float, PathTiming]]:
-        """Time every path, or some, within force limits (k,) or one for all [N]; yield index, limit
-        and the fastest timing."""
+        """Time paths within force limits.
+
+        Args:
+            force: force limit, one per timed path or one for all [N].
+            rows: indices of the paths; None for all.
+
+        Returns:
+            For each path its index, the limit, and the fastest timing.
+        """
         chosen = list(range(len(self)) if rows is None else rows)
         limits = np.broadcast_to(np.asarray(force, dtype=float), (len(chosen),)).tolist()
         known = self._known
@@ -266,10 +276,11 @@ class DrivenPaths:
     def all_options(
         self, own: Array | float, told: Callable[[], None] = lambda: None
     ) -> list[Option]:
-        """Return the options of every path within the path's own force limit and within others.
+        """Return the options of every path: within the path's own force limit and within further
+        limits.
 
-        The others are `FORCES` limits, from just above the static hold to `highest_force`. They are
-        left out where force limits bound robust forces.
+        The further limits are `FORCES` limits from just above the force at rest to `highest_force`.
+        They are left out if force limits bound robust forces.
 
         Args:
             own: own force limit, one per path (k,) or one for all [N].
@@ -296,7 +307,7 @@ class Option:
     Attributes:
         index: index of the path.
         limit: force limit [N].
-        duration: duration without limits on jerk [s].
+        duration: duration of the timing without jerk limits [s].
         force: (2,) largest robust force of each robot [N].
     """
 
@@ -312,7 +323,7 @@ class Option:
 
 
 def ranked(options: Sequence[Option], goal: Goal) -> list[Option]:
-    """Return the options within the limits of a goal, in order of increasing cost."""
+    """Return the options that keep the limits of a goal, in order of increasing cost."""
     kept = [
         option
         for option in options
@@ -324,12 +335,12 @@ def ranked(options: Sequence[Option], goal: Goal) -> list[Option]:
 def best_of_paths(
     paths: DrivenPaths, options: Sequence[Option], goal: Goal, most: int
 ) -> Iterator[Option]:
-    """Yield the option of least cost of each of the best paths, least cost first.
+    """Yield the cheapest option of each of the best paths, cheapest first.
 
-    Force limits between those of the known options are tried as well.
+    Force limits between the limits of the known options are tried too.
 
     Args:
-        paths: the paths, to time within further force limits.
+        paths: the paths of the options.
         options: known options.
         goal: limits and cost of an option.
         most: largest number of paths.
@@ -353,8 +364,8 @@ def best_of_paths(
 def gentle_start(cell: Cell) -> Array:
     """Return the decision vector (n_var,) of the hand-made carry with its best force limit.
 
-    The best limit has the least product of duration and commanded force within the reference
-    forces. If no limit keeps the reference forces, the one with the least commanded force is taken.
+    The best limit gives the least product of duration and commanded force with forces within the
+    reference forces. If no limit does, the limit with the least commanded force is taken.
 
     Args:
         cell: drivable cell.

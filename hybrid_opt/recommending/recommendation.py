@@ -1,7 +1,8 @@
-"""The carry to run with its commanded force, and the reasons: the result of `hybrid_opt.recommend`.
+"""The recommended carry with its commanded force, and the reasons for it: the result of
+`hybrid_opt.recommend`.
 
-It is one carry with one duration, as robots drive it, and one force, the commanded force of its
-job, which holds in every case of the cell's uncertainty.
+The recommendation is one carry with one duration, as robots drive it, and one commanded force,
+which holds the box in every case of the cell's uncertainty.
 """
 
 from __future__ import annotations
@@ -59,40 +60,41 @@ HAND_MADE = "hand-made"
 """Name of the workcell file's own trajectory."""
 
 SHORTENED = 4
-"""Times that a path is driven at most, each with more margin to the wish, until limits on jerk and
-the whole force keep to it as well."""
+"""How often a path is timed at most, each time with more margin, until the carry without jumps of
+acceleration fulfils the wish."""
 
 TRIED = 3
-"""Paths that are driven within limits on jerk before the best of them is chosen."""
+"""Number of paths that are timed within jerk limits before the best of them is chosen."""
 
 STEPS = 4 + FORCES
-"""Steps of a recommendation; each rival adds one."""
+"""Number of steps of a recommendation, for a progress display. Each compared path adds one."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Recommendation(Displayable):
-    """The carry to run.
+    """The recommended carry, with its forces, its job and the reasons for it.
 
     Attributes:
         wish: target of the recommendation.
         member: index of the carry's path in the front.
         x: (n_var,) decision vector: the path, then the force limit [N].
-        timing: timing of the carry within all limits, those on jerk included, without jumps of
+        timing: timing of the carry within all limits, jerk limits included, without jumps of
             acceleration.
         force_kind: kind of force, planned or robust, that the force limit bounds.
-        limited_force: (2,) largest force of this kind of each robot along the carry [N].
-        commanded: (2,) largest normal force to command of each robot [N].
-        squeeze: origin and contributions of these forces.
+        limited_force: (2,) largest force of this kind that each robot exerts along the carry [N].
+        commanded: (2,) largest commanded normal force of each robot [N].
+        squeeze: how the commanded forces came about, with their contributions.
         job: the whole job around the carry; None if no job can be planned.
         margins: largest errors of the cell's description at which the commanded force holds.
-        rivals: other paths, the hand-made one among them, at the same force or duration.
+        rivals: other paths, such as the hand-made one, at the same force or duration.
         advice: effects of changes of the cell on force and duration.
         warnings: objections to the carry, as sentences.
         required: (2,) largest force of each robot in any case of the uncertainty [N].
         budget: grip budget of the box at rest.
-        remedies: smallest changes of the cell with which the required forces keep the reference
-            forces; empty if they already do.
-        reserve: largest mass and least friction of the box within the reference forces.
+        remedies: smallest changes of the cell that bring the required forces within the reference
+            forces; empty if they already are.
+        reserve: largest mass and least friction with which the required forces stay within the
+            reference forces.
         why: reason of the choice, as a text.
     """
 
@@ -135,17 +137,18 @@ class Recommendation(Displayable):
 
     @property
     def duration(self) -> float:
-        """Duration of the carry as driven [s]: that of its job, whose phases take whole ticks."""
+        """Duration of the carry as robots drive it [s]: the duration in the job, whose phases last
+        whole ticks."""
         return self.timing.duration if self.job is None else self.job.phase("carry").duration
 
     @property
     def limit(self) -> float:
-        """Limit on the forces that the carry was searched for [N]."""
+        """Force limit of the carry in the search [N]."""
         return float(self.x[-1])
 
     @property
     def force(self) -> float:
-        """Largest force that is commanded of the force-controlled arm [N]."""
+        """Largest commanded normal force of the force-controlled arm [N]."""
         return self.squeeze.force
 
     def __repr__(self) -> str:
@@ -171,22 +174,23 @@ def recommend(
 ) -> Recommendation:
     """Recommend the carry of a drivable front to run.
 
-    By default this is the carry with the least product of duration and commanded force. Only
-    carries count whose robust forces stay within the reference forces. If there is none, all count,
-    and `Recommendation.objection` states the necessary changes of the cell.
+    By default the carry with the least product of duration and commanded force is recommended.
+    Carries with robust forces above the reference forces are excluded. If all exceed them, none is
+    excluded, and `Recommendation.objection` states the necessary changes of the cell.
 
     Args:
         front: front of a drivable cell, see `Cell.drivable`.
-        wish: another target, or other numbers of the cell; None for the default target.
+        wish: another target, or numbers that replace the cell's; None for the default target.
         others: further paths (n_path,) by label, to compare with the recommended carry; the
             hand-made path is always compared.
-        progress: True for a progress bar, or a function of the numbers of done and of all steps.
+        progress: True for a progress bar, or a function of the finished and the total number of
+            steps.
         alone: True to leave out margins, rivals and advice.
 
     Raises:
-        SettingsError: the cell has another time law, the front is empty, no member can do what is
-            wished for, or the uncertainty leaves no friction or patch.
-        WorkcellError: the cell with the numbers that are wished for is wrong.
+        SettingsError: the cell is not drivable, the front is empty, no member fulfils the wish, or
+            the uncertainty leaves no friction or patch.
+        WorkcellError: the cell with the numbers of the wish is invalid.
     """
     wish = wish or Wish()
     cell = wished_cell(front.cell, wish)
@@ -277,8 +281,12 @@ def _recommended(
 def _driven(
     cell: Cell, paths: DrivenPaths, options: Sequence[Option], goal: Goal, wished: bool
 ) -> tuple[Option, Timing, bool]:
-    """Return the best of the best paths as timed for robots, and whether it keeps to the goal; if
-    none does and no target was wished for, the one that exceeds it least."""
+    """Choose the best carry after timing the best paths without jumps of acceleration.
+
+    Returns:
+        Option and timing of the carry, and True if it fulfils the goal. Without a target, a carry
+        that exceeds the goal least is accepted if none fulfils it.
+    """
     kept, others, reason, model = [], [], "", cell.timing_model
     for first in best_of_paths(paths, options, goal, TRIED):
         own, asked = [option for option in options if option.index == first.index], goal
@@ -324,7 +332,7 @@ def required_forces(workcell: Workcell, carry: Carry) -> Array:
 
 
 def _objections(found: CommandedForces) -> list[str]:
-    """List objections against the commanded forces of a carry."""
+    """Return objections against the commanded forces of a carry, as sentences."""
     squeeze, doubts = found.squeeze, []
     if found.job is None:
         doubts.append(f"no job can be planned: {found.problem}")
@@ -334,12 +342,12 @@ def _objections(found: CommandedForces) -> list[str]:
 
 
 def is_within(required: Array, allowed: Array) -> bool:
-    """Return True if forces (2,) [N] exceed limits (2,) [N] by no more than a share `BETTER`."""
+    """Return True if forces (2,) [N] stay within limits (2,) [N], up to a share `BETTER`."""
     return bool((required <= allowed * (1.0 + BETTER)).all())
 
 
 def _better(beside: Sequence[Alternative], timing: Timing, force: float) -> Iterator[str]:
-    """Yield a statement for each path that is faster at the same force."""
+    """Yield a sentence for each compared path that is faster at the same force."""
     for other in beside:
         if other.duration_at_force < timing.duration * (1.0 - BETTER):
             yield (
@@ -350,13 +358,15 @@ def _better(beside: Sequence[Alternative], timing: Timing, force: float) -> Iter
 
 
 BETTER = 1e-3
-"""Share by which a rival must be shorter to count as better: timings agree that closely."""
+"""A compared path counts as faster if it is shorter by more than this share: timings are no more
+accurate."""
 
 ABOVE_STILL = (1.02, 1.04, 1.06, 1.08, 1.12, 1.2)
-"""Forces of the table over that of holding the payload level and still."""
+"""Forces of the table of durations, as multiples of the force that holds the payload level and at
+rest."""
 
 MEMBERS = 24
-"""Members of a front that are timed, evenly spread over it."""
+"""Number of members of a front that are timed, evenly spread over the front."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -414,7 +424,8 @@ def time_alternative(
 
 
 def level_force(workcell: Workcell, kind: ForceKind) -> float:
-    """Compute the force [N] that holds the payload level and still, the larger of both robots.
+    """Compute the normal force [N] that holds the payload level and at rest, the larger of both
+    robots.
 
     Args:
         workcell: the cell.
@@ -431,8 +442,8 @@ def level_force(workcell: Workcell, kind: ForceKind) -> float:
 def table_forces(workcell: Workcell) -> Array:
     """Return the commanded forces (n,) [N] of the table of durations.
 
-    They are multiples of the robust force that holds the payload level and still, and the reference
-    force.
+    These are multiples of the robust force that holds the payload level and at rest, and the
+    reference force.
 
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
@@ -443,14 +454,14 @@ def table_forces(workcell: Workcell) -> Array:
 
 
 def commanded_durations(paths: DrivenPaths, limits: Array | float, forces: Array) -> Array:
-    """Compute the shortest duration (n,) of any path for each largest commanded force [s].
+    """Compute the shortest duration (n,) [s] of any path under each limit on the commanded force.
 
-    Limits on jerk are left out. The duration is infinite if no path has a timing.
+    Jerk limits are left out. The duration is infinite if no path has a timing.
 
     Args:
         paths: k paths.
         limits: own force limit, one per path (k,) or one for all [N].
-        forces: (n,) largest commanded forces [N].
+        forces: (n,) limits on the commanded force [N].
     """
     if not len(paths):
         return np.full(len(forces), np.inf)
@@ -467,6 +478,7 @@ def commanded_durations(paths: DrivenPaths, limits: Array | float, forces: Array
 
 
 def spread_rows(paths: Array) -> NDArray[np.intp]:
-    """Return evenly spread rows of at most `MEMBERS` different paths (k, n), both ends included."""
+    """Return indices of at most `MEMBERS` distinct rows of paths (k, n), evenly spread, first and
+    last included."""
     different = np.sort(np.unique(paths, axis=0, return_index=True)[1])
     return np.asarray(different[evenly(len(different), MEMBERS)])

@@ -1,1 +1,2 @@
-"""Forces that hold although friction, mass, centre of mass and pads are not exactly known."""
+"""Normal forces that hold the box although friction, mass, centre of mass and pads are known only
+within ranges."""

@@ -1,5 +1,5 @@
-"""Budget of a grip: the force that holds the payload still in every case of the uncertainty, the
-allowed force, and the smallest changes of the cell with which it fits."""
+"""Grip budget: the force that holds the payload at rest in every case of the uncertainty, compared
+with the allowed force, and the smallest changes of the cell with which the force fits."""
 
 from __future__ import annotations
 
@@ -27,37 +27,38 @@ from symbolic.records import Contact, Uncertainty, Workcell
 from symbolic.records.quantities import FRICTION
 
 LISTED = 3
-"""Remedies that are listed, the smallest changes first."""
+"""Number of remedies that are listed, the smallest changes first."""
 
 PRECISION = 1e-4
 """Error of the factor of a remedy, on the safe side."""
 
 UNBOUNDED = 1e3
-"""Excess if no force holds a case: root finding needs finite numbers."""
+"""Value of the excess if no force holds a case, because root finding needs finite numbers."""
 
 NARROWEST = 1e-6
-"""Factor in place of zero: a range of zero width would change the number of worst cases."""
+"""Factor on a range in place of zero, because a range of zero width would change the number of
+worst cases."""
 
 LEAST_MASS = 1e-3
-"""Share of the mass down to which a lighter payload is considered."""
+"""Lighter payloads are considered down to this share of the mass."""
 
 ROUNDING = 1e-6
-"""Share by which a force may exceed a limit that it meets exactly."""
+"""Share by which a force may exceed its limit through rounding."""
 
 HEAVIEST = 1e3
-"""Factor up to which a heavier payload is considered."""
+"""Heavier payloads are considered up to this multiple of the mass."""
 
 LEAST_FRICTION = 0.02
-"""Share of the friction coefficients down to which less friction is considered."""
+"""Less friction is considered down to this share of the coefficients."""
 
 
 @dataclass(frozen=True)
 class Remedy:
-    """A change of the cell with which the required forces fit.
+    """A change of the cell that brings the required forces within the allowed forces.
 
     Attributes:
-        change: the quantity with its new value.
-        share: relative change of that value.
+        change: text with the quantity and its new value.
+        share: relative change of the value.
     """
 
     change: str
@@ -69,14 +70,15 @@ class Remedy:
 
 @dataclass(frozen=True)
 class Reserve:
-    """Largest payload and least friction, each alone, within the reference forces.
+    """Largest payload and least friction with which the required forces stay within the reference
+    forces. Each is changed alone.
 
-    The motion is unchanged. It is held in every case of the uncertainty about the changed value,
-    with the commanded forces that this needs.
+    The motion is unchanged. The forces hold it in every case of the uncertainty about the changed
+    value.
 
     Attributes:
-        payload: the largest mass; the inertia grows with it [kg].
-        friction: the least coefficient of the more slippery pad.
+        payload: largest payload mass [kg]; the inertia grows in proportion.
+        friction: least friction coefficient of the more slippery pad.
     """
 
     payload: Figure
@@ -88,15 +90,16 @@ class Reserve:
 
 @dataclass(frozen=True)
 class GripBudget:
-    """Forces that hold the payload still in every case, and the reference forces.
+    """Forces that hold the payload at rest in every case of the uncertainty, and the reference
+    forces.
 
     Attributes:
-        required: (2,) largest force of each robot at either end of the path, infinite if no force
-            holds every case [N].
+        required: (2,) larger normal force of each robot at the two ends of the path [N]; infinite
+            if no force holds every case.
         allowed: (2,) reference forces [N].
-        uncertainty: the set of cases.
-        remedies: smallest changes of the cell with which the required forces keep the allowed ones;
-            empty if they already do.
+        uncertainty: the ranges of the cases.
+        remedies: smallest changes of the cell that bring the required forces within the allowed
+            forces; empty if they already are.
     """
 
     required: Pair
@@ -121,7 +124,7 @@ class GripBudget:
 
     @property
     def advice(self) -> str:
-        """The remedies as a sentence, '' where none are needed or known."""
+        """The remedies as a sentence; '' if none are needed or known."""
         return remedies_text(self.remedies, "to hold it still; a motion takes more")
 
 
@@ -144,7 +147,8 @@ def remedies_text(remedies: tuple[Remedy, ...], purpose: str) -> str:
 
 
 def grip_budget(workcell: Workcell) -> GripBudget:
-    """Compute the force that holds the payload still at both ends of its path, without compiling.
+    """Compute the force that holds the payload at rest at both ends of its path. Nothing is
+    compiled.
 
     Raises:
         SettingsError: some cases cannot be held by any force, or the uncertainty leaves no friction
@@ -164,12 +168,13 @@ def grip_budget(workcell: Workcell) -> GripBudget:
 def largest_forces(
     model: RobustModel, motion: HeldMotion, rows: NDArray[np.intp] | None = None
 ) -> Array:
-    """Compute the largest robust force (2,) of each robot for a motion and its poses at rest [N].
+    """Compute the largest robust force (2,) of each robot [N], in motion and at rest at the same
+    poses.
 
     Args:
         model: robust forces of the workcell.
         motion: samples of the motion.
-        rows: rows of the worst cases to consider; None for all.
+        rows: indices of the worst cases to consider; None for all.
 
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
@@ -188,8 +193,8 @@ def cheapest_remedies(
     allowed: Array,
     most: int = LISTED,
 ) -> tuple[Remedy, ...]:
-    """Find changes of reference forces, mass, friction or uncertainty, each alone, with which the
-    forces along a motion fit.
+    """Find changes that bring the forces along a motion within the allowed forces: of the reference
+    forces, the mass, friction or the uncertainty, each alone.
 
     Args:
         model: robust forces of the workcell.
@@ -199,7 +204,7 @@ def cheapest_remedies(
         most: largest number of remedies.
 
     Returns:
-        The smallest relative changes first.
+        At most `most` remedies, the smallest relative change first.
     """
     excess = _excess(model, motion, required, allowed)
     found = [*_stronger(required, allowed), *_of_cell(model.workcell, excess)]
@@ -207,7 +212,8 @@ def cheapest_remedies(
 
 
 def reserve(model: RobustModel, motion: HeldMotion, required: Array, allowed: Array) -> Reserve:
-    """Compute the largest payload and the least friction with which forces along a motion fit.
+    """Compute the largest payload and the least friction with which the forces along a motion stay
+    within the allowed forces.
 
     Args:
         model: robust forces of the workcell.
@@ -216,7 +222,7 @@ def reserve(model: RobustModel, motion: HeldMotion, required: Array, allowed: Ar
         allowed: (2,) reference force of each robot [N].
 
     Returns:
-        Mass [kg] and friction, NaN if no value within the considered range suffices.
+        Mass [kg] and friction coefficient; NaN if no value within the considered range suffices.
     """
     excess, workcell = _excess(model, motion, required, allowed), model.workcell
     friction = min(pad.friction for pad in workcell.contacts)
@@ -227,7 +233,8 @@ def reserve(model: RobustModel, motion: HeldMotion, required: Array, allowed: Ar
 
 
 def _last_factor(excess: Callable[[float], float], near: float, far: float) -> float:
-    """Return the factor nearest to `far` without excess, NaN where even `near` has some."""
+    """Return the factor closest to `far` at which `excess` is not positive; NaN if it is positive
+    at `near`."""
     if excess(near) > 0.0:
         return float("nan")
     if excess(far) <= 0.0:
@@ -239,7 +246,8 @@ def _last_factor(excess: Callable[[float], float], near: float, far: float) -> f
 def _excess(
     model: RobustModel, motion: HeldMotion, required: Array, allowed: Array
 ) -> Callable[[Workcell], float]:
-    """Return the relative excess of a changed cell's forces over the allowed ones."""
+    """Return a function of a changed cell: the largest relative excess of its forces over the
+    allowed forces."""
     known = largest_forces(model, motion)
     rows = model.governing_rows(motion, model.workcell.uncertainty, LEADER)
     # What a command holds beyond its motion, as by smoothing, stays in proportion.
@@ -279,7 +287,7 @@ def _stronger(required: Array, allowed: Array) -> Iterator[Remedy]:
 
 
 def _of_cell(workcell: Workcell, excess: Callable[[Workcell], float]) -> Iterator[Remedy]:
-    """Yield what mass, friction and uncertainty would have to be."""
+    """Yield the changes of mass, friction and uncertainty that bring the excess to zero."""
     payload, contacts, uncertainty = workcell.payload, workcell.contacts, workcell.uncertainty
 
     lighter = _smallest_change(lambda factor: excess(_with_mass(workcell, factor)), LEAST_MASS)
@@ -315,7 +323,8 @@ def _of_cell(workcell: Workcell, excess: Callable[[Workcell], float]) -> Iterato
 
 
 def _smallest_change(excess: Callable[[float], float], far: float) -> float | None:
-    """Return the factor nearest to one without excess, None where even `far` has some."""
+    """Return the factor closest to one at which `excess` is not positive; None if it is positive at
+    `far`."""
     if excess(far) > 0.0:
         return None
     root = float(brentq(excess, 1.0, far, xtol=PRECISION))

@@ -51,7 +51,8 @@ def nominal_case(workcell: Workcell) -> Array:
 
 
 def worst_cases(workcell: Workcell, uncertainty: Uncertainty, leader: int = 0) -> Array:
-    """Return cases (k, 18) whose largest squeeze is at least that of every case within the ranges.
+    """Return worst cases (k, 18) of an uncertainty: the largest squeeze among them suffices for
+    every case within the ranges.
 
     Args:
         leader: index of the robot whose force is not commanded.
@@ -76,7 +77,8 @@ def worst_cases(workcell: Workcell, uncertainty: Uncertainty, leader: int = 0) -
 def random_cases(
     workcell: Workcell, uncertainty: Uncertainty, n: int, rng: np.random.Generator, leader: int = 0
 ) -> Array:
-    """Draw n random cases (n, 18) of a set, uniform in its ranges and discs of pad positions."""
+    """Draw n random cases (n, 18), uniform in the ranges of the uncertainty and in the discs of pad
+    positions."""
     cases = np.tile(nominal_case(workcell), (n, 1))
     cases[:, 0:2] *= 1.0 + uncertainty.friction * rng.uniform(-1.0, 1.0, (n, 2))
     cases[:, 4] *= 1.0 + uncertainty.mass * rng.uniform(-1.0, 1.0, n)
@@ -101,16 +103,16 @@ def _in_discs(rng: np.random.Generator, radius: float, n: int, discs: int) -> Ar
 
 @dataclass(frozen=True)
 class GoverningCases:
-    """Worst cases that decide the forces; n samples.
+    """Worst cases that decide the forces at n samples.
 
     Attributes:
         leader: index of the arm that keeps its place.
-        force: (n, 2) by robot: commanded force of the force-controlled arm, largest resulting force
-            of the leading arm [N].
-        commanded: (n,) row of the case that decides the commanded force.
-        leading: (n,) row of the case with the largest excess of the leading arm's force over the
+        force: (n, 2) force of each robot [N]: the commanded force of the force-controlled arm, and
+            the largest resulting force of the leading arm.
+        commanded: (n,) index of the case that decides the commanded force.
+        leading: (n,) index of the case with the largest excess of the leading arm's force over the
             commanded force.
-        share: (n,) transmitted share of that excess, see `transmitted_share`.
+        share: (n,) share of this excess that acts on the leading arm, from `transmitted_share`.
         leading_share: rise of the leading arm's force per newton of commanded force.
     """
 
@@ -122,16 +124,17 @@ class GoverningCases:
     leading_share: float
 
     def at(self, rows: NDArray[np.intp]) -> GoverningCases:
-        """Return the cases at some of the samples."""
+        """Return the governing cases at the samples with these indices."""
         cases = self.commanded[rows], self.leading[rows]
         found = self.force[rows], *cases, self.share[rows]
         return GoverningCases(self.leader, *found, self.leading_share)
 
     def slopes(self, commanded: Array, leading: Array) -> Array:
-        """Compute the derivatives (n, 2, m) of `force`.
+        """Compute the derivatives (n, 2, m) of `force` by m inputs.
 
         Args:
-            commanded, leading: (n, 2, m) derivatives of both robots' forces in these cases.
+            commanded, leading: (n, 2, m) derivatives of both robots' forces in the cases
+                `commanded` and `leading`.
         """
         follower, share = 1 - self.leader, self.leading_share
         found = np.empty_like(commanded)
@@ -142,11 +145,12 @@ class GoverningCases:
 
 
 def transmitted_share(difference: Array, uncertainty: Uncertainty) -> Array:
-    """Compute the largest share of force differences that acts on the leading arm.
+    """Compute the share of the force difference that acts on the leading arm, in the case of the
+    mass for which the leading arm's force is largest.
 
-    The differences, leading less commanded force, are those under the largest mass. A positive one
-    acts in full. A negative one is least for the least mass: (1 - m) / (1 + m) of it acts, m being
-    the uncertainty of the mass.
+    The difference is leading minus commanded force, under the largest mass. A positive difference
+    acts in full. A negative one is smallest in size for the least mass; then (1 - m) / (1 + m) of
+    it acts, m being the uncertainty of the mass.
     """
     lightest = (1.0 - uncertainty.mass) / (1.0 + uncertainty.mass)
     return np.where(difference > 0.0, 1.0, lightest)
@@ -161,12 +165,14 @@ def governing_cases(
 ) -> GoverningCases:
     """Find the worst cases that decide the forces.
 
-    The motion fixes the difference of both forces, independent of the squeeze and proportional to
-    the mass.
+    The motion fixes the difference of both forces; it is independent of the squeeze and
+    proportional to the mass.
 
     Args:
         worst: (k, n, 2) least normal forces of k cases at n samples [N].
-        difference: (k, n) leading less commanded force [N]; by default that of `worst`.
+        uncertainty: the ranges of the cases.
+        leader: index of the arm that keeps its place.
+        difference: (k, n) leading minus commanded force [N]; the difference in `worst` if None.
         leading_share: rise of the leading arm's force per newton of commanded force.
     """
     follower, every = 1 - leader, np.arange(worst.shape[1])

@@ -1,9 +1,9 @@
-"""Least commanded forces that hold every case of an uncertainty set, and the price of robustness:
-forces against the size of the set, and the largest set that the arms' forces allow.
+"""Least commanded forces that hold every case of an uncertainty, and the price of robustness: the
+forces against the size of the uncertainty, and the largest uncertainty that the arms' forces allow.
 
 The leading arm is position controlled; its normal force follows from the motion. The other arm is
-force controlled: its normal force is commanded beforehand, the same in all cases. Motion and case
-fix N_1 - N_2, so that the commanded force decides the squeeze. Pads press evenly in every case
+force controlled; its normal force is commanded beforehand, the same in all cases. The motion and
+the case fix N_1 - N_2, so the commanded force decides the squeeze. Pads press evenly in every case
 (`symbolic.contact.worst_cases`), whichever contact model the plan uses.
 """
 
@@ -42,64 +42,66 @@ if TYPE_CHECKING:
     import casadi as ca
 
 BATCH = 100_000
-"""Samples that are evaluated at once."""
+"""Number of samples that are evaluated together."""
 
 SCREENING_SAMPLES, GOVERNING_CASES = 3, 4
-"""Samples at which governing cases are sought, and their number at each."""
+"""Number of samples at which governing cases are sought, and number of these cases at each
+sample."""
 
 BISECTIONS = 30
 LARGEST_FACTOR, FACTOR_ERROR = 20.0, 1e-6
-"""Largest multiple of a set that is considered, and the error of a result."""
+"""Largest multiple of an uncertainty that is considered, and the error of a result."""
 
 SCREENED = 0.97
-"""Share of the commanded force that suffices for most cases, by a test without a solver."""
+"""Share of the commanded force with which a fast test, without a solver, clears most cases."""
 
 SCREEN_SHARE = 0.99
-"""Share of the friction left by displacements that the test uses: the coefficient that represents
-displacements is right to 0.3 %."""
+"""Share of the friction left by displaced pads that this test assumes: the coefficient that
+represents displacements is accurate to 0.3 %."""
 
 HOLDS = 1e-6
-"""Excess over the commanded force that counts as rounding, as a share of it."""
+"""Excess of a needed force over the commanded force that counts as rounding, as a share."""
 
 MOST, POINTS = 2.0, 9
-"""Largest multiple of the set in a price of robustness, and number of multiples."""
+"""Largest multiple of the uncertainty in a price of robustness, and number of multiples."""
 
 CASES = 100_000
-"""Random cases in which every priced carry is checked."""
+"""Number of random cases in which every priced carry is checked."""
 
 SAMPLES = 100
-"""Evenly spread samples of a carry that are evaluated, besides those of its largest forces."""
+"""Number of evenly spread samples of a carry that are evaluated, besides those of its largest
+forces."""
 
 
 @dataclass(frozen=True)
 class BoxMotion:
-    """Box poses and their time derivatives at n samples, (n, 6) each."""
+    """Box poses (n, 6) and their first and second time derivatives at n samples."""
 
     pose: Array
     rate: Array
     second_rate: Array
 
     def at(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> BoxMotion:
-        """Return the motion at some of the samples."""
+        """Return the motion at the samples with these indices, or at the marked samples."""
         return BoxMotion(self.pose[rows], self.rate[rows], self.second_rate[rows])
 
 
 HeldMotion = BoxMotion | Carry
-"""A motion with poses and their time derivatives."""
+"""A motion given by box poses and their time derivatives."""
 
 
 def motion_inputs(motion: HeldMotion) -> tuple[Array, Array, Array]:
-    """Return pose, rate and second rate of a motion, the inputs of the force functions."""
+    """Return pose, rate and second rate (n, 6) of a motion, the inputs of the force functions."""
     return motion.pose, motion.rate, motion.second_rate
 
 
 def box_motion(motion: HeldMotion) -> BoxMotion:
-    """Return the box poses and rates of a motion alone."""
+    """Return a motion as a `BoxMotion`, without everything else that a carry holds."""
     return BoxMotion(*motion_inputs(motion))
 
 
 def tile_motion(motion: HeldMotion, times: int) -> BoxMotion:
-    """Repeat a motion's samples several times, one after the other."""
+    """Repeat the samples of a motion `times` times, one copy after the other."""
     return BoxMotion(*[np.tile(values, (times, 1)) for values in motion_inputs(motion)])
 
 
@@ -109,17 +111,17 @@ def at_rest() -> BoxMotion:
 
 
 def at_standstill(motion: HeldMotion) -> BoxMotion:
-    """Return the poses of a motion with zero rates."""
+    """Return the motion with the same poses and zero rates."""
     return BoxMotion(motion.pose, 0.0 * motion.rate, 0.0 * motion.second_rate)
 
 
 @dataclass(frozen=True)
 class RobustForce:
-    """Normal forces that hold for every case of a set; n samples.
+    """Normal forces at n samples that hold the box in every case of an uncertainty.
 
     Attributes:
         leader: index of the arm that keeps its place.
-        uncertainty: the set.
+        uncertainty: the ranges of the cases.
         nominal: (n, 2) least normal forces for the nominal case [N].
         commanded: (n,) normal force of the force-controlled arm [N].
         leading: (n,) largest normal force of the leading arm in any case [N].
@@ -141,7 +143,7 @@ class RobustForce:
 
 @dataclass(frozen=True)
 class SampledCheck:
-    """Random cases under commanded forces.
+    """Check of commanded forces in random cases.
 
     Attributes:
         cases: number of cases, each checked at all samples of the carry.
@@ -160,7 +162,7 @@ class SampledCheck:
 
     @property
     def hardest(self) -> str:
-        """`closest` as a text."""
+        """Text that states `closest`."""
         most = "at most " if self.closest == SCREENED else ""
         return f"{most}{100.0 * self.closest:.2f} %"
 
@@ -177,10 +179,13 @@ class RobustModel:
     def __init__(
         self, workcell: Workcell, load: Callable[..., NumericFunction] = contact_function
     ) -> None:
-        """Load or build the functions of pads with a scalar squeeze; those of others on first use.
+        """Load or build the functions of pads with a scalar squeeze. Functions of other pads are
+        built on first use.
 
         Args:
-            load: makes a function, with the arguments of `contact_function`.
+            workcell: the workcell.
+            load: function that loads or builds a compiled function; it has the arguments of
+                `contact_function`.
 
         Raises:
             SettingsError: some cases cannot be held, however hard the pads press.
@@ -200,11 +205,10 @@ class RobustModel:
             self._function(case_slack_function, commanded=1)
 
     def with_workcell(self, workcell: Workcell) -> RobustModel:
-        """Return a model with the same functions.
+        """Return a model of another workcell with the same compiled functions.
 
         Args:
-            workcell: differs from this one only in friction, mass and uncertainty, which cases
-                state.
+            workcell: workcell that differs only in friction, mass and uncertainty.
         """
         other = copy(self)
         other.workcell = workcell
@@ -224,10 +228,10 @@ class RobustModel:
         return self._function(case_squeeze_function, commanded=commanded, displaced=displaced)
 
     def worst_cases(self, uncertainty: Uncertainty, leader: int) -> Array:
-        """Return `worst_cases` of a set, read-only.
+        """Return the worst cases (k, 18) of an uncertainty, read-only.
 
         Raises:
-            SettingsError: the set leaves no friction or patch.
+            SettingsError: the uncertainty leaves no friction or patch.
         """
         return self._worst(CacheKey(uncertainty, leader, known=(id(uncertainty), leader)))
 
@@ -261,8 +265,9 @@ class RobustModel:
     def slack(
         self, motion: HeldMotion, cases: Array, force: Array, leader: int, threads: int = 1
     ) -> Array:
-        """Compute the slack (m,) of `case_slack_function` under commanded forces (m,) [N]. A
-        positive slack proves that the force holds; a negative one proves nothing."""
+        """Compute the slack (m,) of one case per sample under commanded forces (m,) [N], by
+        `case_slack_function`. A positive slack proves that the force holds the case; a negative
+        slack proves nothing."""
         function = self._function(case_slack_function, commanded=1 - leader)
         given = *motion_inputs(motion), cases, force
         return function.batch(*given, threads=threads)["slack"].ravel()
@@ -292,7 +297,8 @@ class RobustModel:
 
     @cached_property
     def leading_share(self) -> Array:
-        """`ContactModel.leading_share` of the commanded forces (2,)."""
+        """Rise of the leading arm's force per newton of commanded force, for either arm leading
+        (2,)."""
         return command_model(self.workcell).leading_share
 
     def hold(
@@ -302,19 +308,20 @@ class RobustModel:
         leader: int = 0,
         rows: NDArray[np.intp] | None = None,
     ) -> tuple[Array, Array]:
-        """Compute the least commanded normal force (n,) that holds every case of a set [N].
+        """Compute the least commanded normal force (n,) that holds every case of an uncertainty
+        [N].
 
         Also return the largest resulting normal force (n,) of the leading arm [N]. Both are
         infinite where no force holds every case.
 
         Args:
             motion: motion at n samples.
-            uncertainty: the set.
+            uncertainty: the ranges of the cases.
             leader: index of the leading arm.
-            rows: rows of the worst cases to consider; None for all.
+            rows: indices of the worst cases to consider; None for all.
 
         Raises:
-            SettingsError: the set leaves no friction or patch.
+            SettingsError: the uncertainty leaves no friction or patch.
         """
         cases = self.worst_cases(uncertainty, leader)
         worst = self.least_squeeze(motion, cases if rows is None else cases[rows], leader)
@@ -326,8 +333,9 @@ class RobustModel:
     def governing_rows(
         self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0
     ) -> NDArray[np.intp]:
-        """Return the rows of the worst cases that need the largest forces at any sample:
-        `GOVERNING_CASES` by the commanded force, and as many by the leading arm's excess."""
+        """Return the indices of the worst cases that need the largest forces at any sample:
+        `GOVERNING_CASES` cases by the commanded force, and as many by the excess of the leading
+        arm's force."""
         worst = self.least_squeeze(motion, self.worst_cases(uncertainty, leader), leader)
         command = worst[:, :, 1 - leader]
         beyond = worst[:, :, leader] - float(self.leading_share[leader]) * command
@@ -342,9 +350,9 @@ class RobustModel:
     ) -> Array:
         """Compute the least commanded force (n,) that holds every case [N], faster than `hold`.
 
-        `slack` finds the cases with the largest forces at a few samples; their forces are solved
-        for. `slack` then proves that most other cases need no more. Of more than `SAMPLES` samples,
-        `SAMPLES` are checked in all cases, the others in the cases that govern there.
+        At a few samples `slack` finds the cases with the largest forces, which are then computed.
+        `slack` proves that most other cases need no more. At most `SAMPLES` samples are checked in
+        all cases, the others only in the cases that govern at these samples.
 
         Args:
             above: (n,) lower bound of the result, or one for all samples [N].
@@ -390,13 +398,16 @@ class RobustModel:
     def robust_force(
         self, motion: HeldMotion, uncertainty: Uncertainty | None = None, leader: int = 0
     ) -> RobustForce:
-        """Compute the least commanded forces that hold for every case.
+        """Compute the least commanded forces that hold in every case of an uncertainty.
 
         Args:
-            uncertainty: the set; the workcell's by default.
+            motion: motion at n samples.
+            uncertainty: the ranges of the cases; None for the workcell's.
+            leader: index of the leading arm.
 
         Raises:
-            SettingsError: the set leaves no friction or patch, or no force holds all of it.
+            SettingsError: the uncertainty leaves no friction or patch, or no force holds every
+                case.
         """
         chosen = self.workcell.uncertainty if uncertainty is None else uncertainty
         commanded, leading = self.hold(motion, chosen, leader)
@@ -415,12 +426,14 @@ class RobustModel:
         rng: np.random.Generator,
         threads: int = 1,
     ) -> SampledCheck:
-        """Check the commanded forces in n random cases of the set, at every sample.
+        """Check commanded forces in n random cases of their uncertainty, at every sample.
 
         Args:
-            motion: the motion of the forces.
-            rng: draws the cases.
-            threads: 0 for one per core; has no influence on the result.
+            motion: motion that the forces belong to.
+            force: the commanded forces with their uncertainty.
+            n: number of cases.
+            rng: generator of the cases.
+            threads: number of threads, 0 for one per core. The result does not depend on it.
         """
         failing, closest, left = 0, SCREENED, n
         step = max(1, BATCH // len(motion.pose))
@@ -446,8 +459,8 @@ class RobustModel:
         leader: int,
         threads: int = 1,
     ) -> Array:
-        """Compute the share (k, n) of the commanded forces (n,) that each of k cases needs, at
-        least `screened`."""
+        """Compute the share (k, n) of the commanded forces (n,) that each of k cases needs. Shares
+        below `screened` are returned as `screened`."""
         n, k = len(motion.pose), len(cases)
         displaced = bool(cases[:, 11:15].any())
         level = screened * (self._friction_left(cases) if displaced and self._one else 1.0)
@@ -461,14 +474,15 @@ class RobustModel:
         return share.reshape(k, n)
 
     def _friction_left(self, cases: Array) -> float:
-        """Compute the least share of friction left by displacements: `slack` knows none."""
+        """Compute the least share of friction that displaced pads leave. `slack` does not know
+        displacements."""
         apart = np.linalg.norm(cases[:, 11:13] - cases[:, 13:15], axis=1)
         lost = command_model(self.workcell).friction_lost(apart) / cases[:, :2].min(axis=1)
         return SCREEN_SHARE * max(0.0, 1.0 - float(lost.max()))
 
     def largest_factor(self, motion: HeldMotion, limit: Array, leader: int = 0) -> float:
-        """Find the largest multiple of the workcell's set whose forces stay within limits (2,) [N],
-        at most `LARGEST_FACTOR`; zero if the nominal forces exceed them."""
+        """Find the largest multiple of the workcell's uncertainty for which the forces stay within
+        limits (2,) [N], at most `LARGEST_FACTOR`; zero if the nominal forces exceed the limits."""
         chosen = self.workcell.uncertainty
         end = allowed_factor(self.workcell, chosen)
 
@@ -481,7 +495,7 @@ class RobustModel:
 
 
 def allowed_factor(workcell: Workcell, uncertainty: Uncertainty) -> float:
-    """Find the largest multiple of a set that leaves some friction and patches, at most
+    """Find the largest multiple of an uncertainty that leaves some friction and patch, at most
     `LARGEST_FACTOR`."""
     low, high = 0.0, LARGEST_FACTOR
     if _has_positive_remainders(workcell, uncertainty.scaled(high)):
@@ -502,11 +516,13 @@ def _has_positive_remainders(workcell: Workcell, uncertainty: Uncertainty) -> bo
 
 
 robust_model = cache_by_workcell(RobustModel)
-"""The model of a workcell, the same one for the same record."""
+"""Return the robust model of a workcell. Repeated calls with the same record return the same
+model."""
 
 
 def interpreted_robust_model(workcell: Workcell) -> RobustModel:
-    """Return the model without compiling its functions, for a few samples."""
+    """Return the robust model of a workcell with interpreted functions, for few samples: nothing is
+    compiled."""
     # Not imported at the top: what is compiled already needs no CasADi.
     from codegen.interpreted import InterpretedFunction
 
@@ -523,13 +539,14 @@ class RobustPrice:
     """The price of robustness of one carry.
 
     Attributes:
-        uncertainty: the set.
-        factors: (k,) multiples of the set for which a force was found.
+        uncertainty: the workcell's uncertainty.
+        factors: (k,) multiples of the uncertainty for which a force was found.
         peak: (k, 2) largest normal force of each robot for each multiple [N].
-        commanded: (2,) largest normal force of each robot for the set itself [N].
+        commanded: (2,) largest normal force of each robot for the uncertainty itself [N].
         limit: (2,) reference forces [N].
-        largest_factor: largest multiple of the set whose forces keep the reference forces.
-        check: commanded forces checked in random cases of the set.
+        largest_factor: largest multiple of the uncertainty for which the forces stay within the
+            reference forces.
+        check: check of the commanded forces in random cases of the uncertainty.
     """
 
     uncertainty: Uncertainty
@@ -550,7 +567,7 @@ def robust_price(
     threads: int = 1,
     points: int = POINTS,
 ) -> RobustPrice:
-    """Compute the price of robustness of a carry against the workcell's set.
+    """Compute the price of robustness of a carry against the workcell's uncertainty.
 
     Args:
         model: robust forces of the carry's workcell.
@@ -559,10 +576,10 @@ def robust_price(
         leader: index of the arm that keeps its place.
         cases: number of random cases.
         threads: number of threads, 0 for one per core.
-        points: number of multiples of the set.
+        points: number of multiples of the uncertainty.
 
     Raises:
-        SettingsError: the set leaves no friction or patch.
+        SettingsError: the uncertainty leaves no friction or patch.
     """
     workcell = model.workcell
     uncertainty = workcell.uncertainty
@@ -586,7 +603,8 @@ def robust_price(
 def subsample(carry: Carry) -> tuple[NDArray[np.intp], BoxMotion]:
     """Return row indices and motion of some samples of a carry.
 
-    The samples are `SAMPLES` evenly spread ones and those with each robot's largest normal force.
+    The samples are `SAMPLES` evenly spread ones and, for each robot, the one with its largest
+    normal force.
     """
     rows = np.union1d(evenly(len(carry), SAMPLES), carry.normal_force.argmax(axis=0))
     return rows, box_motion(carry).at(rows)

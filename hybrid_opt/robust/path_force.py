@@ -1,7 +1,8 @@
-"""Robust forces at points of a path as functions of u'' and u'^2, with their slopes.
+"""Robust forces at points of a path as functions of u'' and u'^2, with derivatives.
 
-In every case the least squeeze is convex in the required force and moment, and these are affine in
-(u'', u'^2). So is the largest over the worst cases, whose slopes are those of the governing case.
+In every case the least squeeze is convex in the required force and moment, which are affine in
+(u'', u'^2). So the largest squeeze over the worst cases is convex too; its slope is the slope of
+the governing case.
 """
 
 from __future__ import annotations
@@ -44,10 +45,10 @@ from symbolic.parameters import HELD, WorkcellParameters
 from symbolic.records import Workcell
 
 BY_TIMING = slice(18, 20)
-"""Where a slope's entries by u'' and u'^2 are."""
+"""Columns of a slope that hold the derivatives by u'' and u'^2."""
 
 BELOW = -np.inf
-"""Normal force of cases that need less than the limit; their force is not computed."""
+"""Normal force of cases that need less than the limit; their forces are not computed."""
 
 
 @dataclass(frozen=True)
@@ -69,12 +70,12 @@ class PathPoints:
         return len(self.a)
 
     def at(self, rows: NDArray[np.intp]) -> PathPoints:
-        """Return some of the points."""
+        """Return the points with these indices."""
         return PathPoints(*[values[rows] for values in self.driven])
 
     @property
     def driven(self) -> tuple[Array, ...]:
-        """Points in the form that `case_slopes_function` takes."""
+        """Arrays of the points in the order in which `case_slopes_function` takes them."""
         return self.pose, self.first, self.second, self.a, self.w
 
     @property
@@ -86,14 +87,14 @@ class PathPoints:
 
 
 class RobustPath:
-    """The compiled functions behind robust forces along paths of one workcell."""
+    """Robust forces along paths of one workcell, from compiled functions."""
 
     def __init__(self, workcell: Workcell) -> None:
         """Load or build the compiled functions.
 
         Raises:
-            SettingsError: the pads' normals are not opposite, or the workcell's set leaves no
-                friction.
+            SettingsError: the pads' normals are not opposite, or the workcell's uncertainty leaves
+                no friction.
             DualArmError: a function cannot be built.
         """
         if not command_model(workcell).has_scalar_squeeze:
@@ -108,11 +109,11 @@ class RobustPath:
         self._excess = contact_function(workcell, "case excess", case_excess_function, lanes=0)
 
     def at(self, points: PathPoints) -> tuple[Array, Array]:
-        """Compute the least normal forces that hold in every case of the workcell's set.
+        """Compute the least normal forces that hold in every case of the workcell's uncertainty.
 
         Returns:
-            (n, 2) forces of both robots [N], and (n, 2, 20) their derivatives by pose, its
-            derivatives by u, u'' and u'^2.
+            Forces (n, 2) of both robots [N], and slopes (n, 2, 20): derivatives by pose (6), its
+            first and second derivative by u (12), u'' and u'^2.
         """
         least = self._model.least_squeeze(points.motion, self._cases, LEADER)
         governing = governing_cases(least, self._set, LEADER, leading_share=self._share)
@@ -121,10 +122,13 @@ class RobustPath:
     def governing_above(
         self, points: PathPoints, level: Array
     ) -> tuple[NDArray[np.intp], GoverningCases]:
-        """Return the points where a force of either robot exceeds a level (n,) [N], and their
-        governing cases; the slopes of all points would take as long as the forces.
+        """Find the points at which the force of either robot exceeds a level (n,) [N].
 
-        `RobustModel.slack` proves that most cases need less.
+        `RobustModel.slack` proves that most cases need less. Slopes are left to `slopes`: for all
+        points they would take as long as the forces.
+
+        Returns:
+            Indices of the points, and their governing cases.
         """
         n, k = len(points), len(self._cases)
         every, cases = tile_motion(points.motion, k), np.repeat(self._cases, n, axis=0)
@@ -145,12 +149,14 @@ class RobustPath:
         return rows, governing_cases(known, self._set, LEADER, beyond, self._share)
 
     def most_demanding(self, points: PathPoints, count: int) -> tuple[Array, Array]:
-        """Compute the forces and slopes of the cases with the largest commanded forces, because
-        each governing case has its own slope.
+        """Compute forces and slopes of the `count` cases with the largest commanded forces at each
+        point.
+
+        Several cases matter to a polish, because each governing case has its own slope.
 
         Returns:
-            (n, 2, count) forces of both robots [N], the largest first, and their slopes
-            (n, 2, count, 20).
+            Forces (n, 2, count) of both robots [N], the largest first, and their slopes (n, 2,
+            count, 20).
         """
         n, least = len(points), self._model.least_squeeze(points.motion, self._cases, LEADER)
         governing = governing_cases(least, self._set, LEADER, leading_share=self._share)
@@ -165,7 +171,7 @@ class RobustPath:
         return force, slope
 
     def slopes(self, points: PathPoints, governing: GoverningCases) -> Array:
-        """Compute the slopes (n, 2, 20) of the forces that these cases decide."""
+        """Compute the slopes (n, 2, 20) of the forces in the governing cases."""
         if not len(points):
             return np.zeros((0, 2, BY_TIMING.stop))
         cases = np.concatenate([self._cases[governing.commanded], self._cases[governing.leading]])
@@ -175,28 +181,30 @@ class RobustPath:
 
 
 robust_path = cache_by_workcell(RobustPath)
-"""The one of a workcell, the same for the same record."""
+"""Return the `RobustPath` of a workcell. Repeated calls with the same record return the same
+object."""
 
 
 LEAST_SHARE = 1e-200
-"""Stands for no share of the commanded force in quotients."""
+"""Divisor in place of a zero share of the commanded force."""
 
 TIED = 1e-6
-"""Share of the largest force by which the force of a further governing case may be less."""
+"""A case governs too if its force is below the largest force by at most this share."""
 
 TRIFLE = 1e-9
-"""Relative reduction of a friction coefficient that makes it the lower one."""
+"""Relative reduction by which a friction coefficient is made the lower of the two."""
 
 SMOOTH = 1e-2
-"""Relative difference of both one-sided changes up to which one case governs."""
+"""One case governs if both one-sided changes differ by less than this share."""
 
 
 class GoverningForce:
-    """The largest commanded force of a carry that holds in every case of its cell's uncertainty.
+    """The largest commanded force along a carry that holds in every case of the workcell's
+    uncertainty, with its derivatives.
 
-    Its derivative is that of the governing case (Danskin's theorem): by the motion, the case and
-    the cell's parameters, or, for pads with any normals, by the load. Where several cases govern,
-    the directional derivative is the largest of theirs.
+    Its derivative is the derivative in the governing case (Danskin's theorem): by the motion, the
+    case and the cell's parameters; for pads without opposite normals, by the load. If several cases
+    govern, the directional derivative is the largest of their derivatives.
 
     Attributes:
         force: the force [N].
@@ -210,7 +218,7 @@ class GoverningForce:
             leader: index of the arm whose force is not commanded.
 
         Raises:
-            SettingsError: no force holds under the uncertainty.
+            SettingsError: no force holds every case of the uncertainty.
         """
         model = robust_model(carry.workcell)
         self._workcell, self._leader = model.workcell, leader
@@ -228,12 +236,16 @@ class GoverningForce:
     def slopes(
         self, low: Workcell, high: Workcell, motions: tuple[BoxMotion, BoxMotion], pads: bool
     ) -> tuple[float, float]:
-        """Compute the change of the force towards the higher and the lower of two neighbouring
-        cells, equally far to either side [N].
+        """Compute the changes of the force [N] if the cell changes a little in either direction.
 
         Args:
+            low, high: two changed cells, equally far from this one to either side.
             motions: motions of the lower and of the higher cell at `samples`.
-            pads: the cells' pads differ; forces of pads with any normals are then solved for again.
+            pads: whether the pads of the cells differ. Forces of pads without opposite normals are
+                then computed anew.
+
+        Returns:
+            Change towards the higher and change towards the lower cell.
         """
         before, after = (
             self._inputs(cell, at, pads) for cell, at in zip((low, high), motions, strict=True)
@@ -251,8 +263,8 @@ class GoverningForce:
         return self._inputs(self._workcell, self._motion, pads=True)
 
     def _inputs(self, cell: Workcell, motion: BoxMotion, pads: bool) -> Array:
-        """Compute the inputs (k, m) of the gradient, or the forces (k, 1) of pads with any normals
-        if the pads differ."""
+        """Compute the inputs (k, m) of the gradient. For pads without opposite normals that differ,
+        compute the forces (k, 1) instead."""
         cases = worst_cases(cell, cell.uncertainty, self._leader)
         assert len(cases) == self._count, "no range of the uncertainty begins or ends"
         cases = cases[self._governing]
@@ -270,8 +282,9 @@ class GoverningForce:
 
     @cached_property
     def _gradient(self) -> Array:
-        """Gradient (k, 2, m) of each governing case's force by `_inputs`, with either friction
-        slightly lower: the lower coefficient decides the share of the opposed force."""
+        """Gradient (k, 2, m) of each governing case's force by `_inputs`, once for either
+        friction coefficient slightly lowered: the lower coefficient decides how the opposed
+        force is shared."""
         if self._squeezed:
             numbers = WorkcellParameters(self._workcell)
             made = case_gradient_function(numbers.symbols(), numbers=True)

@@ -1,13 +1,13 @@
 """Commanded normal forces over time: smooth, and never below the forces that hold the box.
 
-The motion fixes N_1 - N_2, so that the force of one arm decides both. The leading arm is position
-controlled, the other is force controlled (`hybrid_opt.robust`). Additional force presses both pads
-against each other and moves nothing; pads without opposite normals add an internal squeeze within
-all friction cones.
+The motion fixes N_1 - N_2, so the force of one arm decides both. The leading arm is position
+controlled, the other arm is force controlled (`hybrid_opt.robust`). Additional force presses both
+pads against each other and moves nothing. For pads without opposite normals it is an internal
+squeeze within all friction cones.
 
-Planned forces may assume pads that choose their pressure. Commanded forces also hold pads that
-press evenly (`hybrid_opt.robust.force`), in every case of the cell's set. `Squeeze.parts` lists
-the contributions to the largest one.
+Planned forces may assume pads that distribute their pressure freely. Commanded forces also suffice
+for pads that press evenly (`hybrid_opt.robust.force`), in every case of the workcell's uncertainty.
+`Squeeze.parts` lists the contributions to the largest commanded force.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ SMOOTHING = 0.1
 """Half the width of the time window over which commanded forces are smoothed [s]."""
 
 MOST = 16
-"""Samples with the largest forces, for which contributions are reported."""
+"""Number of samples with the largest forces for which contributions are computed."""
 
 STEP = 1e-3
 """Time step of the smoothing [s]."""
@@ -46,8 +46,8 @@ class SqueezeSettings:
     """Settings of the commanded forces.
 
     Attributes:
-        factor: commanded squeeze over the least that holds; None for the force that holds in every
-            case of the workcell's uncertainty.
+        factor: commanded squeeze over the least squeeze that holds the box; None for the force that
+            holds it in every case of the workcell's uncertainty.
         leader: index of the arm that keeps its place.
         smoothing: half the width of the time window of the smoothing [s].
     """
@@ -72,14 +72,14 @@ class SqueezeSettings:
 
 @dataclass(frozen=True)
 class Contribution:
-    """Rise of the force-controlled arm's largest force by one uncertainty [N]."""
+    """Rise of the largest commanded force by one source of uncertainty [N]."""
 
     name: str
     force: float
 
 
 def breakdown_text(contributions: Iterable[Contribution]) -> str:
-    """Format contributions as a sum."""
+    """Format contributions as a sum, such as '70.0 least force + 10.0 friction = 80.0 N'."""
     known = list(contributions)
     terms = " + ".join(f"{each.force:.1f} {each.name}" for each in known)
     return f"{terms} = {sum(each.force for each in known):.1f} N"
@@ -96,22 +96,24 @@ UNCERTAINTY_SOURCES = {
     "arms against one another": ("internal_force",),
     "tracking": ("tracking",),
 }
-"""Sources of uncertainty in the order in which they are added, with the ranges of each."""
+"""Sources of uncertainty in the order in which they are added, with the names of their ranges."""
 
 
 @dataclass(frozen=True)
 class Squeeze:
-    """Origin of the commanded forces.
+    """How the commanded forces came about.
 
     Attributes:
         leader: index of the arm that keeps its place; the other is force-controlled.
-        factor: commanded squeeze over the least that holds, None where the forces are robust ones.
-        uncertainty: the set that the forces hold for, None where a factor was taken.
+        factor: commanded squeeze over the least squeeze that holds the box; None if the forces are
+            robust forces.
+        uncertainty: the uncertainty in every case of which the forces hold the box; None if a
+            factor was used.
         smoothing: half the width of the time window of the smoothing [s].
-        parts: contributions to the largest commanded force, the least force first; their sum is
-            that force.
+        parts: contributions to the largest commanded force, the least force first. They add up to
+            the largest commanded force.
         holders: word for the pads or hands that hold the payload.
-        order: word for their command, as in 'press with 80 N'.
+        order: verb of the command, as in 'press with 80 N'.
     """
 
     leader: int
@@ -148,17 +150,23 @@ def extra_normal_force(
     least: Array,
     itemised: bool = True,
 ) -> tuple[Array, Squeeze]:
-    """Compute the force (n,) that the force-controlled arm presses beyond its planned force [N],
-    and its origin. The force of the other arm rises by `ContactModel.internal_force_ratio`.
+    """Compute the force (n,) [N] that the force-controlled arm presses beyond its planned force.
 
     The commanded force is smooth where the planned forces are. Neither robot presses less than
-    planned, or less than evenly pressing pads need in every case of the set, in motion or at rest.
+    planned, nor less than evenly pressing pads need in any case of the uncertainty, in motion or at
+    rest. The force of the other arm rises by `ContactModel.internal_force_ratio` times as much.
 
     Args:
+        workcell: the workcell.
+        settings: settings of the commanded forces.
         time: (n,) times of the samples, not decreasing [s].
         motion: motion of the box at the samples.
         least: (n, 2) planned normal forces [N].
-        itemised: state the contribution of each source of uncertainty; else one for all.
+        itemised: True for one contribution per source of uncertainty; False for one contribution in
+            total.
+
+    Returns:
+        The extra force, and how it came about.
 
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
@@ -196,7 +204,8 @@ def extra_normal_force(
 def _contributions(
     workcell: Workcell, leader: int, motion: HeldMotion, planned: Array
 ) -> list[Contribution]:
-    """Compute the rise of the largest robust force by each source of uncertainty, in order."""
+    """Compute by how much each source of uncertainty, added in order, raises the largest robust
+    force."""
     uncertainty, names = workcell.uncertainty, tuple[str, ...]()
     before = float(
         _in_every_case(workcell, uncertainty.restrict_to(names), leader, motion, planned).max()
@@ -220,8 +229,8 @@ def _in_every_case(
     motion: HeldMotion,
     planned: Array | float,
 ) -> Array:
-    """Compute the force (n,) that holds every case of a set in motion and at rest [N]; at least the
-    planned one."""
+    """Compute the force (n,) [N] that holds every case of an uncertainty in motion and at rest, at
+    least the planned force."""
     model = robust_model(workcell)
     held = model.commanded(motion, uncertainty, leader, planned)
     return model.commanded(at_standstill(motion), uncertainty, leader, held)
@@ -230,7 +239,8 @@ def _in_every_case(
 def largest_commanded(
     workcell: Workcell, motion: HeldMotion, planned: Array, uncertainty: Uncertainty, leader: int
 ) -> Array:
-    """Compute the largest of the `commanded_forces` (2,) that hold a motion in every case [N].
+    """Compute the largest commanded force of each robot (2,) [N] that holds a motion in every case
+    of an uncertainty.
 
     Only the few samples that can attain the largest forces are computed.
 
@@ -253,10 +263,20 @@ def largest_commanded(
 def commanded_forces(
     workcell: Workcell, carry: Carry, settings: SqueezeSettings, itemised: bool = True
 ) -> tuple[Array, Squeeze]:
-    """Compute the normal forces (n, 2) of both robots along a carry [N], and their origin.
+    """Compute the normal forces (n, 2) [N] to command along a carry.
 
-    The force-controlled arm's planned force rises by `extra_normal_force`, the leader's by this
-    times `ContactModel.internal_force_ratio`.
+    The planned force of the force-controlled arm rises by `extra_normal_force`; that of the leader
+    rises by `ContactModel.internal_force_ratio` times as much.
+
+    Args:
+        workcell: the workcell.
+        carry: the carry at n samples.
+        settings: settings of the commanded forces.
+        itemised: True for one contribution per source of uncertainty; False for one contribution in
+            total.
+
+    Returns:
+        The forces, and how they came about.
     """
     held = carry.normal_force
     extra, squeeze = extra_normal_force(workcell, settings, carry.time, carry, held, itemised)
@@ -267,12 +287,13 @@ def commanded_forces(
 def smooth_above(time: Array, values: Array, width: float) -> Array:
     """Compute a smooth upper bound of a curve, level at both ends.
 
-    It is the maximum within a window, averaged over the same window by a smooth kernel. Every
-    maximum under the kernel covers the point in the kernel's middle, so the average does too.
+    The bound is the maximum of the curve within a window, averaged over the same window by a smooth
+    kernel. Each of these maxima is at least the value in the middle of the kernel, so their average
+    is too.
 
     Args:
         time: (n,) not decreasing [s].
-        values: (n,) linear between the times.
+        values: (n,) values of the curve, linear between the times.
         width: half the width of the window [s].
     """
     count = max(2, int(np.ceil((time[-1] - time[0]) / STEP)) + 1)
