@@ -1,2 +1,5 @@
-"""Polishing of Pareto fronts by nonlinear programming on a smooth form of the problem: `polisher`
-begins, `point` has the loop. docs/explanation/polish.md explains it."""
+"""Polishing of Pareto fronts by nonlinear programming on a smooth form of the problem.
+
+`polisher` is the entry, `point` has the trust-region loop. docs/explanation/polish.md explains
+both.
+"""

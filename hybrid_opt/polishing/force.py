@@ -43,43 +43,51 @@ from hybrid_opt.polishing.solvers.ipopt import ipopt
 from symbolic.array import Array
 
 UNBOUNDED_OFFSET = 1e3
-"""Offset that leaves an objective unbounded [spans]."""
+"""Offset of an objective that leaves it unbounded [spans]."""
 
 LARGER_WEIGHT = 0.5
-"""Weight of the larger objective relative to the sum of both in the balanced middle."""
+"""Weight of the larger objective, relative to the sum of both, in the balanced middle."""
 
 TIE_WEIGHT = 1e-4
-"""Weight of the sum of both objectives relative to the level: excludes weakly efficient points."""
+"""Weight of the sum of both objectives relative to the level. It excludes weakly efficient
+points."""
 
 EPIGRAPH_SLACK = 0.1
-"""Difference of the epigraph variables to the peak forces at the start [spans]."""
+"""Difference between the epigraph variables and the peak forces at the start [spans]."""
 
 LEVEL_BOUND = 2e3
-"""Bound of |phi| and |a|, beyond any scalarisation."""
+"""Bound of |phi| and |a|, larger than any scalarisation needs."""
 
 LEAST_FORCE_RADIUS = 1e-3
 """Radius of the trust region below which a solve ends."""
 
 FORCE_BACKTRACKING = (3 / 4, 2 / 4, 1 / 4)
-"""Fractions of a rejected step that are tried instead."""
+"""Fractions of a rejected step that are tried in its place."""
 
 BARRIER, WIDE_BARRIER, NEAR_BARRIER = 3e-4, 3e-2, 1e-5
-"""First barriers of the solver. A search's point is near the solution but has no multipliers;
-solves that look for other basins first move to the middle of the feasible set."""
+"""First barrier parameters of the solver: usual, wide and near. A point of a search is near the
+solution but has no multipliers. Solves that look for other basins first move to the middle of the
+feasible set."""
 
 NEAR_ROUNDS, NEAR_ITERATIONS = 12, 30
-"""Trust-region iterations from a nearly optimal start, and the solver's iterations in each."""
+"""Number of trust-region iterations from a nearly optimal start, and of solver iterations in
+each."""
 
 SolveMode = Literal["usual", "wide", "near", "brief"]
-"""usual: improve a search's point. wide: look beyond the nearest optimum. near: the start is nearly
-an optimum of the scalarisation, as a neighbour on the front is. brief: end after
-`ProbeSettings.rounds`."""
+"""Effort of a solve. 'usual': improve a search's point. 'wide': look beyond the nearest optimum.
+'near': the start is nearly an optimum of the scalarisation, such as a neighbour on the front.
+'brief': end after `ProbeSettings.rounds` iterations."""
 
 
 @dataclass(frozen=True)
 class Scalarisation:
-    """Objective of one solve; see the module. All (2,) but cost (3,): of the level and both
-    peaks."""
+    """Objective of one solve, with the symbols of the module's formula.
+
+    Attributes:
+        anchor, span: (2,) origin and scale of each peak force over its reference.
+        direction, offset: (2,) phi_j <= direction_j a + offset_j.
+        cost: (3,) weights of the level a and of both phi.
+    """
 
     anchor: Array
     span: Array
@@ -89,26 +97,28 @@ class Scalarisation:
 
     @property
     def limits(self) -> MinimisedForces:
-        """Return the robots with a bounded objective; see `MinimisedForces`."""
+        """For each robot, True if its objective is bounded."""
         first, second = (self.offset < UNBOUNDED_OFFSET).tolist()
         return first, second
 
     def least_level(self, phi: Array) -> float:
-        """Return the least level a for scaled peak forces (2,)."""
+        """Return the least level a that scaled peak forces phi (2,) allow."""
         ahead = self.direction > 0.0
         return float(np.max((phi - self.offset)[ahead] / self.direction[ahead]))
 
     def level(self, peak: Array) -> float:
-        """Compute the minimised value from peak forces (2,) over their references."""
+        """Compute the minimised value of peak forces (2,) over their references."""
         phi = (peak - self.anchor) / self.span
         return float(self.cost @ np.concatenate([[self.least_level(phi)], phi]))
 
 
 def pascoletti_serafini(anchor: Array, span: Array) -> Scalarisation:
-    """Move from the anchor along the diagonal as far as possible, bounded on both sides.
+    """Return the scalarisation that moves from the anchor along the diagonal as far as possible,
+    with both objectives bounded.
 
     Args:
-        anchor, span: (2,) start, and scale of each objective.
+        anchor: (2,) start.
+        span: (2,) scale of each objective.
     """
     return Scalarisation(
         anchor, span, np.ones(2), np.zeros(2), np.array([1.0, TIE_WEIGHT, TIE_WEIGHT])
@@ -116,7 +126,7 @@ def pascoletti_serafini(anchor: Array, span: Array) -> Scalarisation:
 
 
 def extreme_scalarisation(anchor: Array, span: Array, objective: int) -> Scalarisation:
-    """Minimise one objective; the other only breaks ties."""
+    """Return the scalarisation that minimises one objective; the other only breaks ties."""
     free = np.where(np.arange(2) == objective, 0.0, UNBOUNDED_OFFSET)
     return Scalarisation(
         anchor, span, np.eye(2)[objective], free, np.array([1.0, TIE_WEIGHT, TIE_WEIGHT])
@@ -124,14 +134,19 @@ def extreme_scalarisation(anchor: Array, span: Array, objective: int) -> Scalari
 
 
 def balanced_scalarisation(anchor: Array, span: Array) -> Scalarisation:
-    """Minimise the sum of both objectives and half of the larger one: where one robot can relieve
-    the other at little cost, both carry alike, which leaves most room for payload."""
+    """Return the scalarisation that minimises the sum of both objectives plus half of the larger
+    one.
+
+    If one robot can relieve the other at little cost, both then carry alike, which leaves most room
+    for payload.
+    """
     middle = np.full(2, anchor.mean())
     return Scalarisation(middle, span, np.ones(2), np.zeros(2), np.array([LARGER_WEIGHT, 1.0, 1.0]))
 
 
 def scalarisation_for(anchor: Array, span: Array, objective: int | None) -> Scalarisation:
-    """Return the scalarisation of an end of a front, or of its balanced middle for None."""
+    """Return the scalarisation of an end of a front, by its objective; of the balanced middle for
+    None."""
     return (
         balanced_scalarisation(anchor, span)
         if objective is None
@@ -140,11 +155,12 @@ def scalarisation_for(anchor: Array, span: Array, objective: int | None) -> Scal
 
 
 class ForceProgram:
-    """Nonlinear program of a set of rows near one candidate; see the module.
+    """Nonlinear program of the module with a set of rows near one candidate.
 
     Attributes:
         layout: order of the rows.
-        cost, start, low, high: as of `solvers.base.NonlinearProgram`.
+        cost, start, low, high: objective, start and bounds of z, as in
+            `solvers.base.NonlinearProgram`.
     """
 
     def __init__(
@@ -159,9 +175,12 @@ class ForceProgram:
         """Form the program around a candidate.
 
         Args:
-            required: the rows and their required values; forces stay below their peaks.
-            carry: the candidate x (n_var,) on places.
-            radius: half the width of the box of trust, in halves of the variables' ranges.
+            cell: shared data of the cell's programs.
+            required: the rows with their required values. Force rows have no required values.
+            target: the scalarisation.
+            carry: the candidate at places of the path.
+            x: (n_var,) decision vector of the candidate.
+            radius: half the width of the trust region [half ranges of the variables].
         """
         self._cell, self._target, self._n = cell, target, cell.task.n_var
         self.layout = layout = RowLayout(required, sides=2)
@@ -226,7 +245,7 @@ class ForceProgram:
         return self._values
 
     def rows(self, z: Array) -> tuple[Array, Array]:
-        """Return values and slopes at z, the slopes from the same evaluation as the values."""
+        """Return values (n_rows,) and slopes (n_rows, n_variables) of the rows at z."""
         values = self.values(z)
         if self._jacobian is None:
             self._jacobian = self._rows.slopes()
@@ -242,8 +261,10 @@ class ForceProgram:
         return full
 
     def residuals_at(self, x: Array, carry: PlacedCarry) -> Residuals:
-        """Compute residuals at a candidate x with the least-squares multipliers there. Only the
-        variables' own bounds count: those of the trust region would absorb the remaining reduction.
+        """Compute the optimality residuals at a candidate x with least-squares multipliers.
+
+        Only the variables' own bounds count. Bounds of the trust region would absorb the remaining
+        reduction.
         """
         target = self._target
         phi = (carry.peak - target.anchor) / target.span
@@ -252,20 +273,21 @@ class ForceProgram:
         return optimality_residuals(self, z, (low, high))
 
     def candidate(self, z: Array) -> Array:
-        """Return the decision vector (n_var,) at z, within its bounds and the trust region."""
+        """Return the decision vector (n_var,) in z, clipped to its bounds and to the trust
+        region."""
         n = self._n
         return self._cell.unscaled(np.clip(z[:n], self.low[:n], self.high[:n]))
 
 
 @dataclass(frozen=True, kw_only=True)
 class ForceStep(Step):
-    """A step to x (n_var,)."""
+    """A step to a decision vector x (n_var,)."""
 
     x: Array
 
 
 class ForceStepMethod(StepMethod[Iterate, ForceStep]):
-    """Minimise one scalarisation."""
+    """Step method that minimises one scalarisation of both peak forces."""
 
     least_radius, backtracking = LEAST_FORCE_RADIUS, FORCE_BACKTRACKING
 
@@ -281,7 +303,7 @@ class ForceStepMethod(StepMethod[Iterate, ForceStep]):
         self._iterations, self._barrier = iterations, barrier
 
     def evaluate(self, x: Array) -> Iterate:
-        """Evaluate a candidate (n_var,)."""
+        """Evaluate a decision vector x (n_var,)."""
         carry = self.reader.read(x)
         return Iterate(x, carry, self._target.level(carry.peak))
 
@@ -311,20 +333,20 @@ class ForceStepMethod(StepMethod[Iterate, ForceStep]):
     def evaluate_fraction(
         self, begin: Iterate, best: Iterate, step: ForceStep, share: float
     ) -> Iterate | None:
-        """Evaluate a fraction of a step; see `StepMethod`."""
+        """Evaluate the candidate at a share of a step; None if it does not improve on the best."""
         trial = self.evaluate(begin.x + share * (step.x - begin.x))
         return trial if trial.level < best.level else None
 
     def missing_rows(self, trial: Iterate) -> set[Row]:
-        """Return rows at peaks that the program underestimated."""
+        """Return rows at the peaks of a candidate that the program underestimated."""
         return set(self.active.forces.peak_rows(trial.carry, self.limits))
 
 
 class ForceSolver:
-    """Solves for one evaluator's cell. A resource: one per process.
+    """Solver of both peak forces for the cell of one evaluator. Each process needs its own.
 
     Attributes:
-        cell, active, reader: shared by all solves.
+        cell, active, reader: model, row selector and candidate reader, shared by all solves.
         method: solver of the programs.
     """
 
@@ -336,11 +358,12 @@ class ForceSolver:
     def solve(
         self, x: Array, target: Scalarisation, radius: float, mode: SolveMode = "usual"
     ) -> Solution:
-        """Improve a feasible decision vector (n_var,) by a scalarisation.
+        """Improve a feasible decision vector x (n_var,) in the sense of a scalarisation.
 
         Args:
-            radius: of the first trust region [half ranges of the decision variables].
-            mode: effort and barrier; see `SolveMode`.
+            target: the scalarisation.
+            radius: radius of the first trust region [half ranges of the decision variables].
+            mode: effort and barrier.
         """
         rounds, iterations, barrier = self._settings.rounds, self._settings.max_iterations, BARRIER
         if mode == "near":

@@ -19,7 +19,7 @@ def native() -> Any:
     """Return the compiled module.
 
     Raises:
-        BridgeError: it is missing or cannot be loaded.
+        BridgeError: the module is missing or cannot be loaded.
     """
     try:
         return import_module("hybrid_opt.polishing._native")

@@ -23,17 +23,18 @@ class PolishOutcome:
 
     Attributes:
         aim: 'point' improves a point of the given front; 'extreme', 'balance' and 'gap' look for
-            new ones; 'probe' is a short solve that chooses where to look.
-        parent: row of the given front to replace, -1 for a new point.
+            new points; 'probe' is a short solve that chooses where to look.
+        parent: index of the point of the given front that is improved, -1 for a new point.
         status: accepted; optimal (no improvement beyond the tolerance: the original stays);
             rejected by the full evaluation; failed in the solver.
-        reason: why it was not accepted, else empty.
+        reason: reason why the attempt was not accepted, else ''.
         x: (n_var,) new decision vector if accepted, otherwise the start.
-        start, objectives: (2,) before and after; equal if nothing was accepted.
-        residuals: of the solver's last answer, accepted or not.
-        iterations: of the solver, over all trust-region iterations.
-        rounds: trust-region iterations.
-        rows: rows at places of the path in the last program.
+        start, objectives: (2,) objectives before and after the attempt; equal if nothing was
+            accepted.
+        residuals: optimality residuals of the solver's last result, accepted or not.
+        iterations: solver iterations, over all trust-region iterations.
+        rounds: number of trust-region iterations.
+        rows: number of rows at places of the path in the last program.
         seconds: wall time of the attempt, full evaluation and certification included.
     """
 
@@ -56,17 +57,17 @@ class PolishEffort:
     """Effort and success of a polish.
 
     Attributes:
-        solver: of its programs: 'dense', 'ipopt', or 'quadratic' for drivable carries.
-        attempts: solves.
-        counts: attempts by status, and those not accepted also by 'status: reason'.
+        solver: solver of the programs: 'dense', 'ipopt', or 'quadratic' for drivable carries.
+        attempts: number of attempts.
+        counts: number of attempts by status; attempts not accepted also by 'status: reason'.
         success_share: share of the attempted points of the given front that are accepted or
             optimal.
-        seconds, median_attempt_seconds: in total and per attempt.
-        equivalent_evaluations: candidate evaluations that take as long.
-        widest_gap: largest distance of neighbours, as a share of the front's length along both
+        seconds, median_attempt_seconds: time in total and median per attempt [s].
+        equivalent_evaluations: number of candidate evaluations that take as long.
+        widest_gap: largest distance between neighbours, as a share of the front's length along both
             objectives; NaN for fewer than two points.
-        worst_stationarity, worst_feasibility, median_stationarity: residuals of the points that a
-            solve made and that are on the front in the end.
+        worst_stationarity, worst_feasibility, median_stationarity: residuals of the points on the
+            final front that a solve made.
     """
 
     solver: str
@@ -88,13 +89,15 @@ class PolishedFront:
 
     Attributes:
         x: (k, n_var) non-dominated decision vectors, by increasing first objective.
-        objectives: (k, 2) by the full evaluator.
-        parent: (k,) row of the given front that the point is or replaced, -1 for a new one.
-        polished: (k,) whether the polish made the point.
+        objectives: (k, 2) objectives by the full evaluator.
+        parent: (k,) index of the point of the given front that a point is or replaces, -1 for a new
+            point.
+        polished: (k,) True for points that the polish made.
         outcomes: all attempts, in order.
-        solver: of its programs: 'dense', 'ipopt', or 'quadratic' for drivable carries.
-        seconds: in total.
-        evaluation_seconds: measured for one candidate evaluation, the unit of the search.
+        solver: solver of the programs: 'dense', 'ipopt', or 'quadratic' for drivable carries.
+        seconds: total time [s].
+        evaluation_seconds: measured time of one candidate evaluation [s], the unit of a search's
+            effort.
     """
 
     x: Annotated[Array, Shape((None, None))]
@@ -110,7 +113,7 @@ class PolishedFront:
         """Make the arrays read-only.
 
         Raises:
-            ValueError: their lengths differ.
+            ValueError: the arrays have different lengths.
         """
         arrays = (self.x, self.objectives, self.parent, self.polished)
         if len({len(array) for array in arrays}) > 1:
@@ -120,7 +123,8 @@ class PolishedFront:
 
     @property
     def widest_gap(self) -> float:
-        """Return the widest gap; see `PolishEffort`."""
+        """Largest distance between neighbours, as a share of the front's length along both
+        objectives; NaN for fewer than two points."""
         if len(self.objectives) < 2:
             return float("nan")
         sides = np.abs(np.diff(self.objectives, axis=0))
@@ -128,14 +132,14 @@ class PolishedFront:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Count attempts by status, and those not accepted also by 'status: reason'."""
+        """Count attempts by status; attempts not accepted also by 'status: reason'."""
         listed = Counter[str](outcome.status for outcome in self.outcomes)
         listed.update(f"{o.status}: {o.reason}" for o in self.outcomes if o.reason)
         return dict(listed)
 
     @property
     def effort(self) -> PolishEffort:
-        """Summarise effort and success."""
+        """Return the record of effort and success."""
         own = [o.status in ("accepted", "optimal") for o in self.outcomes if o.aim == "point"]
         # Others were judged as they are, without a solver.
         solved = [o for o in self.outcomes if o.rounds or o.status == "failed"]

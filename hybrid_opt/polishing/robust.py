@@ -1,11 +1,11 @@
 """Robust forces in the polish: at the samples of a carry, and along a driven path.
 
-The smooth model has planned forces with two derivatives. Of robust ones it takes values and slopes
-at the candidate of each iteration, exact for the governing cases, and the curvature of planned
-forces. So every iteration's model agrees with the truth to first order, and at a stationary point
-of the iteration the true first-order conditions hold. At every point of a driven path the most
-demanding cases have a row each: if two cases govern alternately, one row alone would admit a step
-that the other forbids.
+The smooth model has planned forces with two derivatives. For robust forces it takes values and
+slopes at the candidate of each iteration, exact for the governing cases, and the curvature of
+planned forces. So the model of every iteration agrees with the true forces to first order, and at a
+stationary point of the iteration the true first-order conditions hold. At every point of a driven
+path the most demanding cases have a row each: if two cases govern alternately, one row alone would
+admit a step that the other forbids.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ from symbolic.smooth.driven import planned_branches
 from symbolic.smooth.samples import motion_function
 
 LEADER = 0
-"""Arm that holds its position, as in the objectives."""
+"""Index of the arm that keeps its position, as in the objectives."""
 
 GOVERNING_CASES = 3
-"""Cases per robot and point of a driven path."""
+"""Number of cases per robot and point of a driven path that have rows."""
 
 ROBUST_ROWS = 2 * GOVERNING_CASES
 
 
 class RobustSamples:
-    """Robust forces along carries of one workcell."""
+    """Robust forces at the samples of carries of one workcell."""
 
     def __init__(self, workcell: Workcell) -> None:
         """Load or build the compiled functions.
 
         Raises:
-            SettingsError: its pads have no robust forces, or its uncertainty leaves no friction or
+            SettingsError: the pads have no robust forces, or the uncertainty leaves no friction or
                 patch.
             DualArmError: a function cannot be built.
         """
@@ -51,13 +51,14 @@ class RobustSamples:
         self._motion = InterpretedFunction(motion_function(workcell.task))
 
     def forces(self, found: Mapping[str, Array]) -> Array:
-        """Compute normal forces (n, 2) [N] from the evaluator's outputs for one candidate."""
+        """Compute the robust forces (n, 2) [N] at n samples from the evaluator's outputs for one
+        candidate."""
         motion = BoxMotion(*[found[name] for name in ("pose", "rate", "second_rate")])
         return self._governing(motion).force
 
     def first(self, x: Array) -> tuple[Array, Array]:
-        """Compute forces (n, 2) [N] of a decision vector (n_var,) and their derivatives (n, 2,
-        n_var)."""
+        """Compute the robust forces (n, 2) [N] of a decision vector x (n_var,), and their
+        derivatives (n, 2, n_var) by x."""
         out = self._motion.batch(np.ascontiguousarray(x)[None])
         rows = out["motion"][0]
         by_x = out["slope"][0].reshape(*rows.shape, len(x))
@@ -78,19 +79,22 @@ class RobustSamples:
 
 
 class RobustForces:
-    """Robust forces at driven points of one workcell, by robot."""
+    """Robust forces of both robots at points of a driven path of one workcell."""
 
     def __init__(self, workcell: Workcell, pose: int) -> None:
-        """Prepare for an extended pose of `pose` entries."""
+        """Prepare for extended poses with `pose` entries."""
         self._forces, self._pose = robust_path(workcell), pose
         self._branches = planned_branches(workcell)
 
     def at(self, path: Sequence[Array], a: Array, w: Array) -> tuple[Array, Array]:
-        """Compute forces (points, ROBUST_ROWS) [N] and their slopes (points, ROBUST_ROWS, 3 pose +
-        2) by the extended pose and its derivatives, u'' and u'^2.
+        """Compute robust forces (points, ROBUST_ROWS) [N] and their slopes (points, ROBUST_ROWS, 3
+        pose + 2).
+
+        Slopes are by the extended pose, its two derivatives by u, u'' and u'^2.
 
         Args:
-            path: extended poses and their derivatives by u (points, pose).
+            path: extended poses and their two derivatives by u, (points, pose) each.
+            a, w: (points,) u'' and u'^2.
         """
         pose, first, second = (np.ascontiguousarray(part[:, :6]) for part in path)
         force, slope = self._forces.most_demanding(
@@ -106,10 +110,10 @@ class RobustForces:
 
     def planned_weights(self, weight: Array, value: Array) -> Array:
         """Return weights (points, quantities) that give robust forces the curvature of planned
-        ones.
+        forces.
 
         Args:
-            weight, value: (points, quantities and robust forces).
+            weight, value: (points, quantities and robust forces) multipliers and values.
         """
         size = weight.shape[1] - ROBUST_ROWS
         found = weight[:, :size].copy()

@@ -1,8 +1,8 @@
 """Settings of a polish. All other numbers are constants beside their use;
-docs/explanation/polish.md explains it.
+docs/explanation/polish.md explains the polish.
 
 Widths along the path are in the path parameter (the whole path is 1), distances in metres, steps in
-half ranges of the decision variables: none of them changes its meaning with the number of samples.
+half ranges of the decision variables. None of them changes its meaning with the number of samples.
 """
 
 from __future__ import annotations
@@ -20,20 +20,21 @@ NumberOrNone = Annotated[int, Range(0, 10**6)]
 Small = Annotated[float, Range(1e-12, 1.0)]
 
 DRIVABLE_ATTEMPTS = 14
-"""Force limits on a drivable front."""
+"""Number of force limits on a drivable front."""
 
 QUICK_ATTEMPTS, QUICK_DRIVABLE_ATTEMPTS = 2, 6
-"""Attempts, and force limits, of a small study."""
+"""Number of attempts, and of force limits, in a small study."""
 
 
 @dataclass(frozen=True)
 class ProbeSettings:
-    """Search for basins far from the front; see `hybrid_opt.polishing.starts`.
+    """Settings of the search for basins far from the front (`hybrid_opt.polishing.starts`).
 
     Attributes:
-        starts: at an end of the front; both ends share them unless one is the other's mirror image.
-        middle_starts: at its balanced middle.
-        rounds: of each short solve.
+        starts: number of starts at the ends of the front. Both ends share them, unless one end is
+            the mirror image of the other.
+        middle_starts: number of starts at the balanced middle of the front.
+        rounds: trust-region iterations of each short solve.
     """
 
     starts: NumberOrNone = 8
@@ -46,13 +47,13 @@ class ProbeSettings:
 
 @dataclass(frozen=True)
 class FillSettings:
-    """Filling of a front between its ends; see `hybrid_opt.polishing.force_front`.
+    """Settings of the filling of a front between its ends (`hybrid_opt.polishing.force_front`).
 
     Attributes:
-        solved: points up to which gaps are filled by solves.
-        members: wanted points of the front; the rest lies on chords between neighbours.
-        attempts: at most, for each of `PolishSettings.attempts`; twice as many if the front stays
-            short.
+        solved: number of points up to which gaps are filled by solves.
+        members: wanted number of points of the front; the rest lies on chords between neighbours.
+        attempts: largest number of attempts in gaps for each of `PolishSettings.attempts`; twice as
+            many if the front stays short.
     """
 
     solved: NumberOrNone = 32
@@ -65,12 +66,12 @@ class FillSettings:
 
 @dataclass(frozen=True)
 class DrivableSettings:
-    """Settings of the polish of drivable cells; see `hybrid_opt.polishing.drive_front`.
+    """Settings of the polish of drivable cells (`hybrid_opt.polishing.drive_front`).
 
     Attributes:
-        first_rounds: trust-region iterations of the first path at most.
+        first_rounds: largest number of trust-region iterations for the first path.
         rounds: trust-region iterations at each force limit.
-        members: gaps of the front, the widest first, that get a point in the end if a path between
+        members: number of gaps, the widest first, that get a point in the end, if a path between
             both neighbours improves the front.
     """
 
@@ -87,13 +88,14 @@ class PolishSettings:
     """All settings that decide the results of a polish.
 
     Attributes:
-        attempts: at points, ends and middle of a front; probes and attempts between them are extra.
-            For drivable carries the force limits of the sweep.
+        attempts: number of attempts at points, ends and middle of a front; probes and attempts in
+            gaps are extra. For drivable carries the number of force limits of the sweep.
         solver: solver of the programs that minimise both peak forces: the dense
             interior-point method of `hybrid_opt.polishing.solvers.dense`, or IPOPT.
-        rounds: greatest number of trust-region iterations at one point.
-        max_iterations: greatest number of solver iterations per program.
-        clearance: distance to obstacles [m] that lets the motion between samples be certified.
+        rounds: largest number of trust-region iterations at one point.
+        max_iterations: largest number of solver iterations per program.
+        clearance: distance to obstacles beyond the tolerance [m]; it allows certification between
+            samples.
         probe: settings of the search for basins far from the front.
         fill: settings of the filling of the front between its ends.
         drivable: settings of the polish of drivable cells.
@@ -113,12 +115,12 @@ class PolishSettings:
 
 
 def default_settings(is_drivable: bool) -> PolishSettings:
-    """Return the settings of a full study of a cell or its drivable variant."""
+    """Return the settings of a full study, of a drivable cell or of another cell."""
     return PolishSettings(attempts=DRIVABLE_ATTEMPTS) if is_drivable else PolishSettings()
 
 
 def quick_settings(is_drivable: bool) -> PolishSettings:
-    """Return settings of a small study: a third as many points from fewer attempts."""
+    """Return the settings of a small study: a third as many points from fewer attempts."""
     if is_drivable:
         return PolishSettings(
             attempts=QUICK_DRIVABLE_ATTEMPTS, drivable=DrivableSettings(members=10)

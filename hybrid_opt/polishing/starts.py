@@ -1,12 +1,12 @@
-"""Starts far from the known front: its ends and its middle lie in several basins of attraction.
+"""Starts far from the known front, whose ends and middle may lie in several basins of attraction.
 
 Many candidates cost less than one attempt, so many are drawn: random changes of a few variables of
 a known carry (`perturb_start`), or of all (`random_starts`). Short solves continue from the better
 half each time (successive halving, Jamieson and Talwalkar 2016). In a cell that is symmetric about
 the plane between both bases, the mirror image of a carry has exchanged objectives; the full
 evaluator checks every image. In the polish of drivable carries the box is rotated about one axis at
-all waypoints, by a share of the rotation that the bounds allow: such a path may collide, which the
-first step of a polish corrects.
+all waypoints, by a share of the rotation that the bounds allow. Such a path may collide; the first
+step of a polish corrects this.
 """
 
 from __future__ import annotations
@@ -23,44 +23,50 @@ from symbolic.records.cell import Workcell
 from symbolic.records.task import POSE_SIZE, Task
 
 COLLISION_BATCH = 16
-"""Candidates that are checked for collisions together: two batches of the widest lanes."""
+"""Number of candidates checked for collisions together: two batches of the widest lanes."""
 
 RANDOM_CANDIDATES = 1000
-"""Random candidates per call."""
+"""Number of random candidates per call."""
 
 PERTURBED_SHARE = 0.15
 """Probability that a perturbation draws a decision variable anew."""
 
 LEAST_CHANGE = 0.3
-"""Least change of the variable that changes most, as a share of its range."""
+"""The variable that a perturbation changes most has to change by at least this share of its
+range."""
 
 SIGNS = {
     0: np.array([-1.0, 1.0, 1.0, 1.0, -1.0, -1.0]),
     1: np.array([1.0, -1.0, 1.0, -1.0, 1.0, -1.0]),
 }
-"""Factors (6,) of a pose's entries in the reflection, by the plane's normal, x or y. The angle
-about the normal stays, the other two change sign."""
+"""Factors (6,) of a pose's entries in a reflection, by the axis of the plane's normal, 0 for x and
+1 for y. The angle about the normal keeps its sign, the other two change sign."""
 
 MIRROR_TOLERANCE = 1e-6
-"""Differences below this are rounding [m, rad]."""
+"""Smaller differences count as rounding [m, rad]."""
 
 ROTATION_SHARES = (0.8, 0.6, 0.4)
-"""Shares of the rotation that the bounds allow, in the order of trial: the first drivable one is
+"""Shares of the rotation that the bounds allow, in the order of trial. The first drivable one is
 taken. Less rotated paths return to their origin."""
 
 LEAST_ROTATION = 0.1
-"""Mean rotation of the waypoints below which a path stays in its basin [rad]."""
+"""A path stays in its basin if its waypoints are rotated by less than this on average [rad]."""
 
 
 def first_feasible(
     evaluator: CandidateEvaluator, x: Array, count: int, objective: int | None = None
 ) -> tuple[NDArray[np.intp], Array]:
-    """Return the first feasible candidates: their rows (k,) and objectives (k, m).
+    """Find the first feasible ones among n candidates.
 
     Args:
+        evaluator: evaluator of the candidates.
         x: (n, n_var) candidates.
-        count: at most so many.
-        objective: sort by this objective, lowest first; None keeps their order.
+        count: largest number of candidates to find.
+        objective: index of the objective by which candidates are sorted, lowest first; None keeps
+            their order.
+
+    Returns:
+        Indices (k,) and objectives (k, m) of the feasible candidates.
     """
     but_collisions = evaluator.evaluate(x, with_collisions=False)
     rows = np.flatnonzero(but_collisions.feasible)
@@ -89,12 +95,15 @@ def perturb_start(
 
     Args:
         x: (n_var,) decision vector.
-        objective: to be low.
-        rng: draws the candidates.
-        candidates, share, away: see `RANDOM_CANDIDATES`, `PERTURBED_SHARE` and `LEAST_CHANGE`.
+        evaluator: evaluator of candidates.
+        objective: index of the objective that decides which candidate is best.
+        rng: generator of the candidates.
+        candidates: number of candidates.
+        share: probability that a variable is drawn anew.
+        away: least change of the variable that changes most, as a share of its range.
 
     Returns:
-        The candidate (n_var,) and its objectives (2,); None if no other one is feasible.
+        The best candidate (n_var,) and its objectives (2,); None if no candidate is feasible.
     """
     low, high = evaluator.lower, evaluator.upper
     shape = candidates, len(x)
@@ -113,8 +122,9 @@ class Start:
 
     Attributes:
         x: (n_var,) feasible decision vector.
-        objectives: (2,).
-        is_exhausted: a solve from it gained nothing, so every other would, too.
+        objectives: (2,) objectives of x.
+        is_exhausted: True if a solve from this start gained nothing; a further solve would not
+            either.
     """
 
     x: Array
@@ -122,7 +132,7 @@ class Start:
     is_exhausted: bool = False
 
     def value(self, objective: int | None) -> float:
-        """Return an objective, or the sum of both for None."""
+        """Return the objective with this index; the sum of both for None."""
         return float(self.objectives.sum() if objective is None else self.objectives[objective])
 
 
@@ -138,10 +148,10 @@ def random_starts(
 
 @dataclass(frozen=True)
 class Mirror:
-    """Reflection of one cell's decision vectors, with exchanged arms.
+    """Reflection of a cell's decision vectors that exchanges both arms.
 
     Attributes:
-        task: the cell's.
+        task: task of the cell.
         sign, shift: (n_var,) image = sign * x + shift.
     """
 
@@ -150,15 +160,16 @@ class Mirror:
     shift: Array
 
     def image(self, x: Array) -> Array | None:
-        """Reflect a decision vector (n_var,); None if the image is outside the bounds."""
+        """Return the mirror image of a decision vector (n_var,); None if it is outside the
+        bounds."""
         low, high, image = self.task.lower, self.task.upper, self.sign * x + self.shift
         inside = (image >= low - MIRROR_TOLERANCE) & (image <= high + MIRROR_TOLERANCE)
         return np.clip(image, low, high) if inside.all() else None
 
 
 def mirror_of(workcell: Workcell) -> Mirror | None:
-    """Return the reflection about the plane between both bases if that is upright along a world
-    axis and maps the ends of the path onto themselves; otherwise None."""
+    """Return the reflection about the plane between both bases; None if this plane is not upright
+    along a world axis, or the reflection does not map the ends of the path onto themselves."""
     task = workcell.task
     first, second = (robot.T_world_base[:3, 3] for robot in workcell.robots)
     across = np.flatnonzero(np.abs(first - second) > MIRROR_TOLERANCE).tolist()
@@ -174,12 +185,14 @@ def mirror_of(workcell: Workcell) -> Mirror | None:
 
 
 def rotated_starts(task: Task, path: Array, durations: Callable[[Array], Array]) -> list[Array]:
-    """Rotate the box at all waypoints and return drivable paths (n_path,), at most one per axis and
-    direction.
+    """Rotate the box at all waypoints of a path and return the drivable results (n_path,), at most
+    one per axis and direction.
 
     Args:
         path: (n_path,) original path.
-        durations: function of paths (n, n_path) to durations (n,), infinite without a timing.
+        task: task of the path.
+        durations: function from paths (n, n_path) to durations (n,) [s], infinite for paths without
+            a timing.
     """
     found = []
     columns = task.free_entries[1]

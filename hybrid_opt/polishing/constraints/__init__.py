@@ -1,2 +1,2 @@
-"""Constraints of the polish: rows near their bounds, required values and violations; one file per
-kind."""
+"""Constraints of the polish, one file per kind: rows near their bounds, required values, violated
+rows."""

@@ -1,14 +1,15 @@
 """Selection of rows for a program, and the working set of a solve.
 
-A bound that a rejected step tightened was measured where that step led. Bounds of distances are not
-smooth, and a much shorter step need not satisfy them. So only the share of the tightening counts
-that the trust region reaches of the way to the candidate that caused it. With the full tightening
-in a small region the only feasible step would be to that candidate.
+A rejected step tightens the bounds of the rows that it violates. These bounds hold at the end of
+the rejected step. Bounds of distances are not smooth, so a much shorter step need not satisfy them.
+Therefore only a share of the tightening counts: the share of the way to the rejected candidate that
+the trust region covers. With the full tightening, the only feasible step in a small region would
+lead to that candidate.
 
-Rows are at local minima along the path. Where two minima are equally low, each step raises the one
-with a row and lowers the other, without end. Therefore, in the polish of drivable carries, active
-rows stay in the working set while steps are short. After a long step they would hold the payload on
-its former side of an edge.
+Rows are at local minima along the path. Where two minima are equally low, each step would raise the
+one with a row and lower the other, without end. Therefore, in the polish of drivable carries,
+active rows stay in the working set while steps are short. After a long step they are dropped, since
+they would hold the payload on its former side of an edge.
 """
 
 from __future__ import annotations
@@ -40,17 +41,17 @@ from symbolic.smooth.passage import AxisSwitchGap, SeparatingAxisGap
 from symbolic.smooth.places import Clearance, JointLimit, ManipulabilityLimit
 
 LEAST_TIGHTENING = 1e-4
-"""Least rise of a required value that counts as new [m, rad, 1]."""
+"""Smallest rise of a required value that counts as new [m, rad, 1]."""
 
 ACTIVE_ROW_LIFETIME = 3
-"""Programs for which a row stays after it was active last."""
+"""Number of programs for which a row stays in the working set after it was last active."""
 
 
 class RowSelector:
-    """Selects the rows of a program for candidates of one evaluator.
+    """Selector of the rows of programs for candidates of one evaluator.
 
-    Carries in drivable cells have no rows at samples: `hybrid_opt.polishing.drive`
-    limits their forces.
+    In drivable cells there are no rows at samples: `hybrid_opt.polishing.drive` limits the forces
+    of the timing.
     """
 
     def __init__(self, cell: SmoothCell) -> None:
@@ -70,7 +71,7 @@ class RowSelector:
         }
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> set[Row]:
-        """Return rows of all constraints near their bounds at a candidate."""
+        """Return the rows of all constraints that are near their bounds at a candidate."""
         rows = set[Row]()
         for kind in self._kinds.values():
             for row in kind.near_rows(carry, limits):
@@ -81,10 +82,13 @@ class RowSelector:
     def violated_rows(
         self, carry: PlacedCarry, known: PlacedCarry, program_rows: Collection[Row]
     ) -> set[Row]:
-        """Return rows of all constraints that a step from a known candidate violates.
+        """Return the rows of all constraints that a step from a known candidate violates.
 
         Args:
-            program_rows: rows of the program. Their forces are no violation: they raise the peaks.
+            carry: candidate after the step.
+            known: candidate before the step.
+            program_rows: rows of the program. Their force rows are never violated, because a force
+                above its peak raises the peak.
         """
         rows = set[Row]()
         for kind in self._kinds.values():
@@ -97,8 +101,8 @@ class RowSelector:
     def has_violation(
         self, carry: PlacedCarry, known: PlacedCarry, program_rows: Collection[Row]
     ) -> bool:
-        """Return True if a step violates anything; distances, the most expensive, are checked last
-        and only until one is too small."""
+        """Return True if a step violates any constraint. Distances are the most expensive, so they
+        are checked last and only until one is too small."""
         return any(
             row not in program_rows or not isinstance(row, ForceRow)
             for kind in self._kinds.values()
@@ -110,7 +114,8 @@ class RowSelector:
     def required_values(
         self, carry: PlacedCarry, rows: Iterable[Row], is_relaxed: bool = False
     ) -> dict[Row, float]:
-        """Return the required value of each row at a candidate; see `ConstraintKind`."""
+        """Return the value that each row has to exceed, computed at a candidate by the kind of the
+        row."""
         values: dict[Row, float] = {}
         for kind, own in self._by_kind(rows).items():
             values.update(zip(own, kind.required_values(carry, own, is_relaxed), strict=True))
@@ -123,7 +128,8 @@ class RowSelector:
         rows: Iterable[Row],
         before: Mapping[Row, float],
     ) -> dict[Row, float]:
-        """Return the required values of violated rows; see `ConstraintKind`."""
+        """Return the values that violated rows have to exceed from now on, computed by the kinds of
+        the rows."""
         values: dict[Row, float] = {}
         for kind, own in self._by_kind(rows).items():
             margins = [before.get(row, 0.0) for row in own]
@@ -148,13 +154,13 @@ class RowSelector:
 
 
 class WorkingSet:
-    """Rows added by the steps of one solve, with the value that each has to exceed."""
+    """Rows that the steps of one solve have added, with the value that each has to exceed."""
 
     def __init__(self, active: RowSelector, half: Array) -> None:
-        """Start empty.
+        """Start with no rows.
 
         Args:
-            active: selects rows.
+            active: selector of rows.
             half: (n,) half ranges of the variables that steps move.
         """
         self._active, self._half = active, half
@@ -164,13 +170,14 @@ class WorkingSet:
     def required_values(
         self, carry: PlacedCarry, limits: MinimisedForces, x: Array, radius: float, is_relaxed: bool
     ) -> dict[Row, float]:
-        """Return the rows of the next program about a candidate, and their required values.
+        """Return the rows of the next program about a candidate, with their required values.
 
         Args:
-            carry: the candidate's.
-            x: its variables, (n,) or more.
-            radius: of the trust region.
-            is_relaxed: see `ConstraintKind.required_values`.
+            carry: the candidate at places of the path.
+            limits: whether the force of each robot is minimised.
+            x: variables of the candidate, (n,) or more.
+            radius: radius of the trust region.
+            is_relaxed: True to require no more than a feasible candidate satisfies.
         """
         rows = (
             self._active.near_rows(carry, limits) | self._tightened.keys() | self._active_for.keys()
@@ -191,10 +198,13 @@ class WorkingSet:
         violated: Iterable[Row],
         required: Mapping[Row, float],
     ) -> bool:
-        """Add the rows that a step to x violated; return True if any is new or tighter.
+        """Add the rows that a rejected step to x violates; return True if any row is new or gets a
+        tighter bound.
 
         Args:
-            carry, known: after the step, and before.
+            carry, known: candidate after and before the step.
+            x: decision vector after the step.
+            violated: the violated rows.
             required: rows of the program and their required values.
         """
         is_new = False
@@ -206,17 +216,17 @@ class WorkingSet:
         return is_new
 
     def add(self, rows: Iterable[Row], x: Array) -> None:
-        """Add the rows that were missing for a step to x, with their usual bounds."""
+        """Add rows that the program of a step to x lacked, with their usual bounds."""
         self._tightened.update(dict.fromkeys(rows, (-np.inf, x)))
 
     def mark_active(self, rows: Iterable[Row]) -> None:
-        """Keep rows with multipliers for the next `ACTIVE_ROW_LIFETIME` programs."""
+        """Keep these active rows for the next `ACTIVE_ROW_LIFETIME` programs."""
         left = {row: count - 1 for row, count in self._active_for.items() if count > 1}
         self._active_for = left | dict.fromkeys(rows, ACTIVE_ROW_LIFETIME)
 
     def on_new_best(self, keep_active_set: bool = False) -> None:
-        """Discard bounds relative to the former candidate, and after a long step the active
-        rows."""
+        """Discard bounds that are relative to the former best candidate. Unless `keep_active_set`
+        is True, discard the active rows too."""
         if not keep_active_set:
             self._active_for = {}
         self._tightened = {

@@ -1,13 +1,12 @@
 """Rows of distances: of the arms, and of the payload that passes an obstacle.
 
-The smooth bound of a clearance may be lower than the true distance by a centimetre. So a row
-requires the wanted distance less the difference between the measured distance, or the sharp bound,
-and the smooth one at the current candidate; if the solution moves on and that was too much, the
-next iteration corrects it.
+The smooth bound of a clearance may be a centimetre below the true distance. So a row requires the
+wanted distance minus this error, measured at the current candidate. If the error changes on the way
+to the solution, the next iteration corrects it.
 
 Between two boxes the bound is the largest of a few gaps along single directions. A row with one of
 these gaps is smooth. Where the largest gap changes from a falling to a rising one, the payload
-passes an edge, and the height of that kink gets a row of its own (`symbolic.smooth.passage`).
+passes an edge, and the height of this kink gets a row of its own (`symbolic.smooth.passage`).
 """
 
 from __future__ import annotations
@@ -32,38 +31,40 @@ from symbolic.smooth.passage import AxisSwitchGap, SeparatingAxisGap
 from symbolic.smooth.places import Clearance
 
 BODY_DISTANCE = 0.03
-"""Pairs with an arm's body nearer than this get a row at their minima [m]."""
+"""A pair with an arm's body gets rows at its minima below this distance [m]."""
 
 MEASURED_BELOW = 0.02
-"""Bounds lower than this are replaced by measured distances [m]."""
+"""Lower bounds below this are replaced by measured distances [m]."""
 
 BESIDE_CLEARANCE = 0.015
-"""Distance of further rows on both sides of a violated clearance."""
+"""Distance along the path of further rows on both sides of a violated clearance."""
 
 GAP_DISTANCE, GAP_STRIDE = 0.03, 0.02
-"""The payload's gaps below the distance [m] get a row in every such stretch: they are cheap,
-because they need no joints, and decide the path."""
+"""Every stretch with a gap of the payload below this distance [m] gets rows at this stride. These
+rows are cheap, because they need no joints, and they decide the path."""
 
 FAR_GAP_DISTANCE, FAR_GAP_STRIDE = 0.08, 0.04
-"""The same for larger gaps, less densely."""
+"""The same for larger gaps, with fewer rows."""
 
 KINK_DISTANCE = 0.06
-"""Kinks of the payload's clearance lower than this get a row [m]."""
+"""Kinks of the payload's clearance below this height get a row [m]."""
 
 BESIDE_KINK = 0.03
-"""Distance from a kink within which gaps get no rows: they would hold the kink in its place."""
+"""Distance along the path from a kink within which gaps get no rows: they would hold the kink in
+its place."""
 
 KINK_WINDOW = 0.04
-"""Distance from a kink within which its height is measured."""
+"""Distance along the path from a kink within which its height is measured."""
 
 
 class DistanceConstraintKind(ConstraintKind[PathRow]):
-    """A kind with distances of a pair as values; `window` is the range of places in which a row's
-    distance is measured.
+    """Kind of constraint on the distance of a pair.
 
     Attributes:
-        wanted, least: (n_pairs,) required distance of each pair, and the one below which it is
-            violated [m].
+        window: number of places on both sides of a row over which the distance is measured.
+        wanted, least: (n_pairs,) required distance of each pair, and the distance below which the
+            constraint is violated [m].
+        separable: pairs with known gaps.
     """
 
     window: int = 0
@@ -80,8 +81,8 @@ class DistanceConstraintKind(ConstraintKind[PathRow]):
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[PathRow], is_relaxed: bool = False
     ) -> list[float]:
-        """Return the wanted distances less the smooth bound's error; the margin at places out of
-        reach."""
+        """Return the wanted distances minus the error of the smooth bound; a small margin at places
+        out of reach."""
         values = np.full(len(rows), PATCH_MARGIN)
         chosen = [k for k, row in enumerate(rows) if row.place < carry.reached]
         if not chosen:
@@ -99,7 +100,8 @@ class DistanceConstraintKind(ConstraintKind[PathRow]):
         return values.tolist()
 
     def violations(self, carry: PlacedCarry) -> dict[int, Array]:
-        """Return distances (reached,) of every pair that is too close [m], by pair."""
+        """Return the distances (reached,) [m] along the path of every pair that is too close, by
+        pair."""
         close = carry.distances.interpolated_clearance < self.least
         pairs = np.flatnonzero(close.any(axis=0)).tolist()
         truth = carry.distances.at(close)
@@ -107,7 +109,7 @@ class DistanceConstraintKind(ConstraintKind[PathRow]):
 
 
 def pair_of(row: PathRow) -> int:
-    """Return the active pair of a row with a distance as value."""
+    """Return the index of the active pair that a distance row belongs to."""
     assert isinstance(row.constraint, Clearance | SeparatingAxisGap | AxisSwitchGap)
     return row.constraint.pair
 
@@ -118,15 +120,15 @@ class Clearances(DistanceConstraintKind):
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows of pairs with a small bound."""
+        """Return rows of the pairs whose lower bound is small."""
         for pair in np.flatnonzero(carry.distances.bounds.min(axis=0) < BODY_DISTANCE).tolist():
             if pair not in self.separable:
                 for place in local_minima_below(carry.distances.bounds[:, pair], BODY_DISTANCE):
                     yield PathRow(Clearance(pair, self._columns[pair]), place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return rows of pairs that are too close: at the minimum and around it; an interpolated
-        minimum counts at two neighbours."""
+        """Return rows of the pairs that are too close, at the minimum and around it. An
+        interpolated minimum has rows at both neighbouring places."""
         width = self.grid.places(BESIDE_CLEARANCE)
         for pair, distance in self.violations(carry).items():
             if pair in self.separable:
@@ -141,7 +143,7 @@ class SeparatingAxisGaps(DistanceConstraintKind):
     """Rows of single gaps between the payload and a box, away from kinks."""
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows along every stretch where the payload is near, at a few places each."""
+        """Return rows at a few places of every stretch along which the payload is near."""
         grid = self.grid
         beside = grid.places(BESIDE_KINK)
         stretches = (
@@ -160,8 +162,8 @@ class SeparatingAxisGaps(DistanceConstraintKind):
                 yield separation(pair, gaps, place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return rows at places that are too close and far from every kink of the known candidate,
-        in whose directions the rows are."""
+        """Return rows at places that are too close and far from every kink of the known candidate.
+        Each row has the direction of the known candidate's largest gap."""
         half = self.grid.places(KINK_WINDOW) // 2
         for pair, gaps, place, near in violated_passages(self, carry, known):
             if not near:
@@ -171,14 +173,14 @@ class SeparatingAxisGaps(DistanceConstraintKind):
 
 
 class AxisSwitchGaps(DistanceConstraintKind):
-    """Rows of the kinks where the payload passes an edge."""
+    """Rows of the kinks at which the payload passes an edge."""
 
     def __init__(self, cell: SmoothCell) -> None:
         super().__init__(cell)
         self.window = cell.grid.places(KINK_WINDOW)
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows of low kinks."""
+        """Return rows of the kinks with a small height."""
         for pair, gaps in near_gaps(self, carry):
             for kink, place in edges(gaps, KINK_DISTANCE):
                 yield passing(pair, gaps, kink, place)
@@ -192,12 +194,12 @@ class AxisSwitchGaps(DistanceConstraintKind):
 
 @dataclass(frozen=True)
 class Gaps:
-    """Gaps of a separable pair along every direction at m places.
+    """Gaps of a separable pair along n directions at m places.
 
     Attributes:
-        along: (m, n) [m].
-        best: (m,) direction of the largest.
-        height: (m,) the largest [m].
+        along: (m, n) gap along each direction [m].
+        best: (m,) index of the direction with the largest gap.
+        height: (m,) largest gap [m].
     """
 
     along: Array
@@ -206,14 +208,14 @@ class Gaps:
 
     @classmethod
     def from_values(cls, along: Array) -> Gaps:
-        """Collect the gaps along all directions (m, n) [m]."""
+        """Find the largest of the gaps along all directions (m, n) [m] at each place."""
         best = along.argmax(axis=1)
         return cls(along, best, along[np.arange(len(best)), best])
 
 
 def edges(gaps: Gaps, limit: float) -> list[tuple[int, int]]:
-    """Return kinks lower than a limit [m]: the place before each, and the lower one of both
-    neighbours."""
+    """Return the kinks below a limit [m]. Each is a pair: the place before the kink, and the lower
+    of its two neighbouring places."""
     best, height, along = gaps.best, gaps.height, gaps.along
     return [
         (k, k + int(height[k + 1] < height[k]))
@@ -225,7 +227,7 @@ def edges(gaps: Gaps, limit: float) -> list[tuple[int, int]]:
 
 
 def passing(pair: int, gaps: Gaps, kink: int, place: int) -> PathRow:
-    """Return the row of a kink of `edges`."""
+    """Return the row of a kink that `edges` found."""
     before, after = (int(gaps.best[k]) for k in (kink, kink + 1))
     return PathRow(AxisSwitchGap(pair, before, after), place)
 
@@ -236,7 +238,7 @@ def separation(pair: int, gaps: Gaps, place: int) -> PathRow:
 
 
 def near_gaps(kind: DistanceConstraintKind, carry: PlacedCarry) -> Iterable[tuple[int, Gaps]]:
-    """Return every separable pair that comes near, and its gaps."""
+    """Yield every separable pair that comes near, with its gaps."""
     for pair in np.flatnonzero(carry.distances.bounds.min(axis=0) < FAR_GAP_DISTANCE).tolist():
         if pair in kind.separable:
             yield pair, Gaps.from_values(carry.gaps(pair))
@@ -245,8 +247,8 @@ def near_gaps(kind: DistanceConstraintKind, carry: PlacedCarry) -> Iterable[tupl
 def violated_passages(
     kind: DistanceConstraintKind, carry: PlacedCarry, known: PlacedCarry
 ) -> Iterable[tuple[int, Gaps, int, list[tuple[int, int]]]]:
-    """Return places that are too close: pair, gaps of the known candidate, place, its kinks
-    nearby."""
+    """Yield the places at which a separable pair is too close: the pair, the gaps of the known
+    candidate, the place, and the known candidate's kinks near it."""
     window = kind.grid.places(KINK_WINDOW)
     for pair, distance in kind.violations(carry).items():
         if pair not in kind.separable:

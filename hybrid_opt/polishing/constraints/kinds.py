@@ -19,20 +19,21 @@ from symbolic.contact.registry import contact_model
 from symbolic.smooth.places import JointLimit, ManipulabilityLimit, Side
 
 PATCH_MARGIN = 1e-6
-"""Margin to the rims of patches, in the square of shift over radius."""
+"""Margin to the rim of a patch, in the square of shift over radius."""
 
 SAMPLING_MARGIN = 2e-3
-"""Margin to joint limits [rad] and, in the square of |det J| over its least value, to
-singularities: it covers the path between places."""
+"""Margin to joint limits [rad], and to singularities in the square of |det J| over its least
+allowed value. It covers the path between places."""
 
 CONE_TIGHT = 0
-"""Branch of the normal force that governs unless the box is accelerated across by nearly 1 g."""
+"""Index of the branch of the normal force with tight friction cones. It governs unless the lateral
+acceleration of the box approaches 1 g."""
 
 FORCE_STRIDE = 0.02
-"""Distance of force rows along the path: forces are smooth there."""
+"""Distance between force rows along the path, where forces are smooth."""
 
 TIE_STRIDE = 0.06
-"""Distance of force rows of a robot whose force only breaks ties."""
+"""Distance between force rows along the path, for a robot whose force only breaks ties."""
 
 PEAK_SHARE = 0.98
 """Local maxima of the force above this share of the highest get rows."""
@@ -41,26 +42,27 @@ BRANCH_SHARE = 0.02
 """Branches within this share of the governing one get rows."""
 
 PRESSURE_SHARE = 0.7
-"""Shifts of the centre of pressure beyond this share of the patch get rows."""
+"""Shifts of the centre of pressure beyond this share of the patch radius get rows."""
 
 PRESSURE_STRIDE = 0.04
-"""Distance of further rows on both sides of the largest shift."""
+"""Distance along the path of further rows on both sides of the largest shift."""
 
 JOINT_DISTANCE = 0.05
-"""Joints nearer to a limit get a row [rad]."""
+"""Joints closer to a limit than this get a row [rad]."""
 
 MANIPULABILITY_SHARE, MANIPULABILITY_STRIDE = 0.9, 0.02
-"""Stretches of the path with |det J| below this share of its median get rows: low values bound the
-reach, beyond which nothing is defined."""
+"""Stretches of the path with |det J| below this share of its median get rows at this stride: low
+values bound the reach, beyond which nothing is defined."""
 
 SINGULAR_RATIO, SINGULAR_STRIDE = 1.1, 0.005
-"""Stretches below this multiple of the least |det J| get denser rows."""
+"""Stretches with |det J| below this multiple of its least allowed value get rows at this closer
+stride."""
 
 LOST_ARM_STRIDE = 0.04
-"""Rows follow the loss of an arm at this distance and at twice this distance."""
+"""If an arm loses the path, rows follow this place at this distance and at twice this distance."""
 
 MinimisedForces = tuple[bool, bool]
-"""Per robot whether its force is minimised, not only used to break ties."""
+"""For each robot, True if its force is minimised, False if it is only used to break ties."""
 
 AnyRow = TypeVar("AnyRow", ForceRow, PressureRow, PathRow)
 
@@ -69,9 +71,9 @@ class ConstraintKind(ABC, Generic[AnyRow]):
     """One kind of constraint.
 
     Attributes:
-        cell, grid: the model and the places along its path.
-        persists: whether tightened bounds stay valid at other candidates. Those of other kinds are
-            relative to the candidate that they were measured at.
+        cell, grid: the smooth model and the places along its path.
+        persists: whether tightened bounds stay valid at other candidates. If not, they are relative
+            to the candidate at which they were measured.
     """
 
     persists: bool = False
@@ -81,19 +83,21 @@ class ConstraintKind(ABC, Generic[AnyRow]):
 
     @abstractmethod
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[AnyRow]:
-        """Return rows near their bounds at a candidate."""
+        """Return the rows that are near their bounds at a candidate."""
 
     @abstractmethod
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[AnyRow]:
-        """Return rows that a step from a known candidate violates."""
+        """Return the rows that a step from a known candidate violates."""
 
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[AnyRow], is_relaxed: bool = False
     ) -> list[float]:
-        """Return the value that each row has to exceed, by a candidate.
+        """Return the value that each row has to exceed, computed at a candidate.
 
         Args:
-            is_relaxed: require no more than a feasible candidate satisfies.
+            carry: the candidate at places of the path.
+            rows: the rows.
+            is_relaxed: True to require no more than a feasible candidate satisfies.
         """
         return [PATCH_MARGIN] * len(rows)
 
@@ -103,18 +107,19 @@ class ConstraintKind(ABC, Generic[AnyRow]):
         """Return the values that violated rows have to exceed from now on.
 
         Args:
-            carry: after the step.
-            known: before the step.
-            before: required values of the rows so far, the margin for new ones.
+            carry: candidate after the step.
+            known: candidate before the step.
+            rows: the violated rows.
+            before: required values of the rows so far; the margin for new rows.
         """
         return self.required_values(carry, rows)
 
 
 class Forces(ConstraintKind[ForceRow]):
-    """Rows of the branch with tight cones along the whole path, and of other branches that nearly
-    govern.
+    """Rows of normal forces: of the branch with tight friction cones along the whole path, and of
+    other branches where they nearly govern.
 
-    Required values have no meaning: a force stays below its peak, which is a variable.
+    Required values have no meaning here: a force has to stay below its peak, which is a variable.
     """
 
     persists = True
@@ -131,7 +136,7 @@ class Forces(ConstraintKind[ForceRow]):
         self._main = PROGRAM_BRANCH if by_program else CONE_TIGHT
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[ForceRow]:
-        """Return rows at every few samples, at the peaks and beside them."""
+        """Return rows at every few samples, and at the peaks and beside them."""
         samples = self._every | self._ends | self._peaks(carry)
         for robot, limited in enumerate(limits):
             for sample in samples if limited else samples & self._ties:
@@ -139,11 +144,11 @@ class Forces(ConstraintKind[ForceRow]):
         yield from self._other_branches(carry)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[ForceRow]:
-        """Return rows of other branches that govern."""
+        """Return rows of the other branches where they govern."""
         return self._other_branches(carry)
 
     def peak_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> set[ForceRow]:
-        """Return rows at peaks that the program underestimated."""
+        """Return rows at the peaks of a candidate, which the program underestimated."""
         return {
             ForceRow(robot, self._main, sample)
             for robot, limited in enumerate(limits)
@@ -152,11 +157,11 @@ class Forces(ConstraintKind[ForceRow]):
         }
 
     def _values(self, carry: PlacedCarry) -> Array:
-        """Compute the branches (samples, 2, branches) of the forces [N]."""
+        """Compute all branches (samples, 2, branches) of both robots' normal forces [N]."""
         return np.asarray(np.einsum("rbk,nk->nrb", self.cell.coefficients, carry.split))
 
     def _peaks(self, carry: PlacedCarry) -> set[int]:
-        """Return samples at and beside local maxima of either robot's normal force."""
+        """Return the samples at local maxima of either robot's normal force, and beside them."""
         has_branches = self.cell.robust is None and self._main == CONE_TIGHT
         force = self._values(carry).max(axis=2) if has_branches else carry.force
         inner = force[1:-1]
@@ -166,9 +171,9 @@ class Forces(ConstraintKind[ForceRow]):
         return {int(k) for k in (tops[:, None] + np.array([-1, 0, 1])).ravel()}
 
     def _other_branches(self, carry: PlacedCarry) -> list[ForceRow]:
-        """Return rows of branches other than the tight cones' that govern, or nearly do.
+        """Return rows where a branch other than the one with tight cones governs, or nearly does.
 
-        Robust forces have one row per sample, of the governing case.
+        Robust forces have only one row per sample, for the governing case.
         """
         if self.cell.robust is not None or self._main == PROGRAM_BRANCH:
             return []
@@ -182,16 +187,18 @@ class Forces(ConstraintKind[ForceRow]):
 
 
 class Pressure(ConstraintKind[PressureRow]):
-    """Rows at and beside the largest shift of every stretch near the rim of a patch."""
+    """Rows of the shift of pressure: at its maximum in every stretch near the rim of a patch, and
+    beside it."""
 
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PressureRow]:
-        """Return rows of shifts beyond a share of the patch radius."""
+        """Return rows where the shift exceeds a share of the patch radius."""
         return self._beyond(carry, PRESSURE_SHARE)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PressureRow]:
-        """Return rows of shifts at the rim; half of the margin is left to the solver's rounding."""
+        """Return rows where the shift reaches the rim. Half of the margin is left to the solver's
+        rounding."""
         return self._beyond(carry, (1.0 - PATCH_MARGIN / 2.0) ** 0.5)
 
     def _beyond(self, carry: PlacedCarry, share: float) -> Iterable[PressureRow]:
@@ -204,7 +211,7 @@ class Pressure(ConstraintKind[PressureRow]):
 
 
 class JointLimits(ConstraintKind[PathRow]):
-    """Rows at the local minima of every joint's distance to its limits."""
+    """Rows of joint limits, at the local minima of every joint's distance to its limits."""
 
     persists = True
 
@@ -213,13 +220,14 @@ class JointLimits(ConstraintKind[PathRow]):
         return self._below(carry, JOINT_DISTANCE)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return rows of joints within half of the margin to a limit, or beyond it."""
+        """Return rows of joints that are beyond a limit or have used more than half of the
+        margin."""
         return self._below(carry, SAMPLING_MARGIN / 2.0)
 
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[PathRow], is_relaxed: bool = False
     ) -> list[float]:
-        """Return the margin that covers the path between places."""
+        """Return the margin to the limits, which covers the path between places."""
         return [SAMPLING_MARGIN] * len(rows)
 
     def _below(self, carry: PlacedCarry, limit: float) -> Iterable[PathRow]:
@@ -236,13 +244,14 @@ class JointLimits(ConstraintKind[PathRow]):
 
 
 class ManipulabilityLimits(ConstraintKind[PathRow]):
-    """Rows where |det J| is low: beyond the reach nothing else is defined."""
+    """Rows where |det J| is low, because nothing is defined beyond the reach of an arm."""
 
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows every few places below a share of the median along the path, and denser ones
-        near the least value, so that the minimum does not move between two rows."""
+        """Return rows every few places where |det J| is below a share of its median along the path,
+        and closer rows near its least allowed value, so that the minimum does not move between two
+        rows."""
         places = self.grid.places
         for arm in (0, 1):
             measure = carry.manipulability[:, arm]
@@ -253,8 +262,9 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
                 yield PathRow(ManipulabilityLimit(arm), place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return rows below the least value and half of the margin; and where an arm loses the path
-        and after it: there it is stretched out and so singular."""
+        """Return rows where |det J| is below its least allowed value plus half of the margin. If an
+        arm loses the path, return also rows at this place and after it, where the arm is stretched
+        out and so singular."""
         least = (1.0 + SAMPLING_MARGIN / 2.0) ** 0.5
         for arm in (0, 1):
             for place in local_minima_below(carry.manipulability[:, arm], least):
@@ -267,13 +277,13 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[PathRow], is_relaxed: bool = False
     ) -> list[float]:
-        """Return the margin that covers the path between places."""
+        """Return the margin to the least value, which covers the path between places."""
         return [SAMPLING_MARGIN] * len(rows)
 
     def tightened_bounds(
         self, carry: PlacedCarry, known: PlacedCarry, rows: Sequence[PathRow], before: list[float]
     ) -> list[float]:
-        """Return, where an arm lost the path, the middle of the old bound and the known candidate's
+        """Return, if an arm lost the path, the mean of the old bound and the known candidate's
         value."""
         if not carry.unreachable_arms:
             return self.required_values(carry, rows)

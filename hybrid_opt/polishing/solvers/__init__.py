@@ -1,1 +1,1 @@
-"""Solvers: what a program is, what comes of it, and one file for each method."""
+"""Solvers: the interface of programs and answers, and one file for each method."""

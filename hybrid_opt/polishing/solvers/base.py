@@ -1,6 +1,7 @@
 """Interface of nonlinear programs and their solvers.
 
-Optimality is not taken from a solver: `optimality_residuals` recomputes it from the program.
+A solver's report of optimality is not trusted: `optimality_residuals` recomputes it from the
+program.
 """
 
 from __future__ import annotations
@@ -17,29 +18,29 @@ OPTIMALITY_TOLERANCE = 1e-6
 """Tolerance of the optimality conditions, in scaled rows and variables."""
 
 FEASIBLE_ROW = 1e-3
-"""Violation of a scaled row at which an iterate counts as feasible."""
+"""An iterate counts as feasible if no scaled row is violated by more than this."""
 
 FEASIBILITY_PATIENCE = 3
-"""Multiple of the wanted iterations after which a solve ends without a feasible iterate: stopped
-earlier, it ends in an obstacle more often than not."""
+"""A solve without a feasible iterate ends after this multiple of the wanted iterations. Stopped
+earlier, it usually ends in an obstacle."""
 
 MOST_SOLVE_SECONDS = 60.0
-"""Wall time after which a solve is stopped. Large, because a result that depends on it is not
-reproducible."""
+"""Wall time after which a solve is stopped [s]. It is large, because a result that depends on it is
+not reproducible."""
 
 ACTIVE_SLACK = 0.1
-"""Slack below which an inequality may have a multiplier."""
+"""Only an inequality with a smaller slack may have a multiplier."""
 
 NNLS_ITERATIONS = 30
-"""Iterations of the least squares per inequality."""
+"""Iterations of the least-squares method per inequality."""
 
 
 class NonlinearProgram(Protocol):
-    """A nonlinear program: minimise cost . z within bounds, with every row at least zero.
+    """A nonlinear program: minimise cost . z within bounds, with every row nonnegative.
 
     Attributes:
         cost: (n_variables,) gradient of the linear objective.
-        start, low, high: (n_variables,).
+        start, low, high: (n_variables,) start and bounds of z.
     """
 
     cost: Array
@@ -54,7 +55,8 @@ class NonlinearProgram(Protocol):
         """Return values (n_rows,) and slopes (n_rows, n_variables) at z."""
 
     def curvature(self, z: Array, weights: Array) -> Array:
-        """Return second derivatives (n_variables, n_variables) of weights . rows at z."""
+        """Return the second derivatives (n_variables, n_variables) of the weighted sum of the rows
+        at z."""
 
 
 @dataclass(frozen=True)
@@ -62,9 +64,9 @@ class Residuals:
     """Residuals of the optimality conditions of a program.
 
     Attributes:
-        stationarity: largest entry of the Lagrangian's gradient (scaled variables).
+        stationarity: largest entry of the Lagrangian's gradient, in scaled variables.
         feasibility: largest violation of a row or bound.
-        complementarity: largest product of a multiplier and its slack.
+        complementarity: largest product of a multiplier and the slack of its row or bound.
     """
 
     stationarity: Figure
@@ -72,24 +74,24 @@ class Residuals:
     complementarity: Figure
 
     def scaled(self, unit: float) -> Residuals:
-        """Return residuals of the objective in units that are `unit` times smaller."""
+        """Return the residuals for an objective in a unit that is 1 / `unit` times as large."""
         return Residuals(unit * self.stationarity, self.feasibility, unit * self.complementarity)
 
 
 UNKNOWN = Residuals(np.nan, np.nan, np.nan)
-"""Residuals of a solve without an answer."""
+"""Residuals of a solve without a result."""
 
 
 @dataclass(frozen=True)
 class Answer:
-    """Answer of a solver of nonlinear programs.
+    """Result of a solver of nonlinear programs.
 
     Attributes:
         z: (n_variables,) last iterate.
-        message: its status.
+        message: status message of the solver.
         converged: whether the solver reports an optimum.
         usable: whether z is finite.
-        iterations: of the solver.
+        iterations: number of iterations.
     """
 
     z: Array
@@ -100,16 +102,17 @@ class Answer:
 
 
 Solve = Callable[[NonlinearProgram, int, float], Answer]
-"""A solver: function of a program, the wanted number of iterations and the first barrier."""
+"""A solver: function of a program, the wanted number of iterations and the first barrier
+parameter."""
 
 
 def optimality_residuals(
     program: NonlinearProgram, z: Array, bounds: tuple[Array, Array] | None = None
 ) -> Residuals:
-    """Compute residuals at z with the least-squares multipliers there.
+    """Compute optimality residuals at z with least-squares multipliers.
 
     Args:
-        bounds: lower and upper (n_variables,) instead of the program's.
+        bounds: lower and upper bounds (n_variables,); None for the program's.
     """
     low, high = bounds or (program.low, program.high)
     rows, slopes = program.rows(z)
@@ -124,9 +127,10 @@ def residuals(
     """Compute residuals of the optimality conditions at z with given multipliers.
 
     Args:
-        at_bounds: (n_variables,) multipliers of upper bounds, negative for lower ones.
-        y: (n_rows,) of the rows.
-        bounds: of the variables, lower and upper (n_variables,).
+        at_bounds: (n_variables,) multipliers of the bounds, positive for upper and negative for
+            lower ones.
+        y: (n_rows,) multipliers of the rows.
+        bounds: lower and upper bounds (n_variables,) of the variables.
     """
     (low, high), (rows, slopes) = bounds, program.rows(z)
     lagrangian = program.cost - slopes.T @ y + at_bounds
@@ -141,15 +145,19 @@ def residuals(
 def estimate_multipliers(
     cost: Array, A: Array, slacks: tuple[Array, Array, Array]
 ) -> tuple[Array, Array]:
-    """Estimate multipliers by nonnegative least squares of the optimality conditions: better than
-    an iteration's own after an early stop.
+    """Estimate multipliers by nonnegative least squares on the optimality conditions.
+
+    After an early stop they are more accurate than the multipliers of the iteration.
 
     Args:
-        cost, A: gradients of the objective (n,) and of the inequalities (m, n).
-        slacks: of the inequalities (m,), of the lower and of the upper bounds (n,).
+        cost: (n,) gradient of the objective.
+        A: (m, n) gradients of the inequalities.
+        slacks: slacks of the inequalities (m,), of the lower bounds (n,) and of the upper bounds
+            (n,).
 
     Returns:
-        Of upper bounds (n,), negative for lower ones, and of the inequalities (m,), nonnegative.
+        Multipliers of the bounds (n,), positive for upper and negative for lower ones, and of the
+        inequalities (m,), nonnegative.
     """
     # Not imported at the top: it takes long, and records of polishes are read without it.
     from scipy.optimize import nnls

@@ -12,8 +12,8 @@ With all inequalities h(z) >= 0, h(z) - s = 0 and the multipliers y, each step s
 
     (W + A^T D A + E) dz = -c + A^T (mu / s - D r) + mu / (z - low) - mu / (high - z),
 
-A = dh/dz, D = y / s, r = h - s, W the Hessian of the Lagrangian, E that of the bounds' barrier. The
-iteration is in `dense.cpp`, which calls the program.
+with A = dh/dz, D = y / s, r = h - s, W the Hessian of the Lagrangian, and E the Hessian of the
+bounds' barrier. The iteration is in `dense.cpp`, which calls the program.
 """
 
 from __future__ import annotations
@@ -31,7 +31,12 @@ from hybrid_opt.polishing.solvers.base import (
 
 
 def dense(program: NonlinearProgram, iterations: int, barrier: float) -> Answer:
-    """Solve a program; see `solvers.base.Solve`.
+    """Solve a program by the dense interior-point method.
+
+    Args:
+        program: the program.
+        iterations: wanted number of iterations.
+        barrier: first barrier parameter.
 
     Raises:
         BridgeError: the compiled part is missing.

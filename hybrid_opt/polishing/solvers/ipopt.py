@@ -44,8 +44,8 @@ Shapes = Mapping[str, ca.Sparsity]
 
 
 class _Callback(ca.Callback):  # type: ignore[misc]  # CasADi has no types
-    """A Python function of vectors (n,) as CasADi calls it; the first methods answer its
-    queries."""
+    """A Python function of vectors (n,) in the form that CasADi calls. The `get_` methods answer
+    CasADi's queries."""
 
     def __init__(
         self, name: str, inputs: Shapes, outputs: Shapes, evaluate: Callable[..., list[Any]]
@@ -85,10 +85,10 @@ class _Callback(ca.Callback):  # type: ignore[misc]  # CasADi has no types
 
 
 def _functions(program: NonlinearProgram, wanted: int) -> tuple[_Callback, dict[str, _Callback]]:
-    """Return a program for nlpsol, and its derivatives with the stopping rule.
+    """Return a program for CasADi's `nlpsol`, and its derivatives with the stopping rule.
 
-    A solve that is stopped at an arbitrary iterate ends in an obstacle more often than not. It
-    stops after the wanted number of iterations at the first feasible iterate.
+    The solve stops at the first feasible iterate after the wanted number of iterations. Stopped at
+    an arbitrary iterate, it usually ends in an obstacle.
     """
     n, m, iterations = len(program.start), len(program.values(program.start)), 0
     x, p, g = ca.Sparsity.dense(n), ca.Sparsity(0, 0), ca.Sparsity.dense(m)
@@ -124,7 +124,13 @@ def _functions(program: NonlinearProgram, wanted: int) -> tuple[_Callback, dict[
 
 
 def ipopt(program: NonlinearProgram, iterations: int, barrier: float) -> Answer:
-    """Solve a program with IPOPT; see `solvers.base.Solve`."""
+    """Solve a program with IPOPT.
+
+    Args:
+        program: the program.
+        iterations: wanted number of iterations.
+        barrier: first barrier parameter.
+    """
     nlp, functions = _functions(program, iterations)
     limits = {"ipopt.mu_init": barrier, "ipopt.max_iter": FEASIBILITY_PATIENCE * iterations}
     solver = ca.nlpsol("polish", "ipopt", nlp, OPTIONS | functions | limits)

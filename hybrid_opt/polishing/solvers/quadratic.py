@@ -33,29 +33,30 @@ from hybrid_opt.polishing.native import native
 from symbolic.array import Array
 
 QUADRATIC_TOLERANCE = 1e-8
-"""Tolerance of the conditions, relative to their terms, and of the objective."""
+"""Tolerance of the optimality conditions relative to their terms, and of the objective."""
 
 ACCEPTED_RESIDUAL = 1e-5
-"""Residual at which an answer is accepted; of the objective, relative to its own terms."""
+"""Largest residual of an accepted answer; of the objective relative to its own terms."""
 
 LEAST_CURVATURE = 1e-6
-"""Least curvature by the path in the convex model."""
+"""Least curvature in the path's variables in the convex model."""
 
 NEGATIVE_CURVATURE_SHARE = 0.1
-"""Factor of the absolute value of a negative curvature in the convex model: positive, and small
-enough that the trust region bounds steps along it."""
+"""Factor that turns the absolute value of a negative curvature into the curvature of the convex
+model: positive, and so small that the trust region bounds steps along it."""
 
 Ending = Literal["solved", "infeasible", "failed"]
 
 
 @dataclass(frozen=True)
 class BorderedMatrix:
-    """A symmetric matrix: a tridiagonal block with a border.
+    """A symmetric matrix of a border with k variables and a tridiagonal block, the chain, with n
+    variables.
 
     Attributes:
-        corner: (k, k) of the border.
-        beside: (n, k) of the chain by the border.
-        diagonal, off: (n,) and (n - 1,) of the chain.
+        corner: (k, k) block of the border.
+        beside: (n, k) block that couples chain and border.
+        diagonal, off: (n,) and (n - 1,) diagonal and off-diagonal of the chain.
     """
 
     corner: Array
@@ -64,7 +65,7 @@ class BorderedMatrix:
     off: Array
 
     def plus(self, other: BorderedMatrix, weight: float = 1.0) -> BorderedMatrix:
-        """Add a multiple of another matrix."""
+        """Return the sum of the matrix and a multiple of another."""
         return BorderedMatrix(
             self.corner + weight * other.corner,
             self.beside + weight * other.beside,
@@ -73,14 +74,14 @@ class BorderedMatrix:
         )
 
     def add_diagonal(self, by: Array) -> BorderedMatrix:
-        """Return the matrix with (k + n,) added to its diagonal."""
+        """Return the matrix with a vector (k + n,) added to its diagonal."""
         k = len(self.corner)
         corner = self.corner.copy()
         corner[np.diag_indices(k)] += by[:k]
         return BorderedMatrix(corner, self.beside, self.diagonal + by[k:], self.off)
 
     def times(self, d: Array) -> Array:
-        """Multiply by (k + n,)."""
+        """Multiply the matrix by a vector (k + n,)."""
         k = len(self.corner)
         border, chain = d[:k], d[k:]
         product = self.beside @ border + self.diagonal * chain
@@ -102,13 +103,13 @@ class BorderedMatrix:
 
 @dataclass(frozen=True)
 class BorderedRows:
-    """Rows A with entries in the border and in at most two neighbours of the chain.
+    """Rows with entries in the border and in at most two neighbouring variables of the chain.
 
     Attributes:
-        border: (rows, k).
-        column: (rows,) first of the two neighbours.
-        left, right: (rows,) entries there.
-        n_chain: variables of the chain.
+        border: (rows, k) entries in the border.
+        column: (rows,) index of the first of the two chain variables.
+        left, right: (rows,) entries in these two variables.
+        n_chain: number of variables of the chain.
     """
 
     border: Array
@@ -121,33 +122,33 @@ class BorderedRows:
         return len(self.border)
 
     def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> BorderedRows:
-        """Return some of the rows."""
+        """Return the marked rows, or the rows with these indices."""
         border, left, right = (part[chosen] for part in (self.border, self.left, self.right))
         return BorderedRows(border, self.column[chosen], left, right, self.n_chain)
 
     @cached_property
     def _spread(self) -> sparse.csr_array:
-        """Return the chain's part (n, rows), transposed."""
+        """The transposed part (n, rows) of the rows in the chain."""
         entries = np.concatenate([self.left, self.right])
         where = np.concatenate([self.column, self.column + 1]), np.tile(np.arange(len(self)), 2)
         return sparse.csr_array((entries, where), shape=(self.n_chain, len(self)))
 
     def times(self, d: Array) -> Array:
-        """Return A d (rows,)."""
+        """Return A d (rows,) of these rows A."""
         k = self.border.shape[1]
         border, chain = d[:k], d[k:]
         beside = self.left * chain[self.column] + self.right * chain[self.column + 1]
         return np.asarray(self.border @ border + beside)
 
     def transpose_times(self, y: Array) -> Array:
-        """Return A^T y (k + n,)."""
+        """Return A^T y (k + n,) of these rows A."""
         n = self.n_chain
         chain = _summed(self.column, self.left * y, n)
         chain += _summed(self.column + 1, self.right * y, n)
         return np.concatenate([y @ self.border, chain])
 
     def squares(self, weight: Array) -> BorderedMatrix:
-        """Return A^T diag(weight) A."""
+        """Return A^T diag(weight) A of these rows A."""
         n, weighted = self.n_chain, self.border * weight[:, None]
         by_left, by_right = weight * self.left, weight * self.right
         diagonal = _summed(self.column, by_left * self.left, n)
@@ -161,18 +162,18 @@ class BorderedRows:
 
 
 def _summed(column: NDArray[np.intp], values: Array, n: int) -> Array:
-    """Sum values by column (n,)."""
+    """Sum values that belong to the same of n columns; return the sums (n,)."""
     return np.asarray(np.bincount(column, values, n), dtype=float)
 
 
 @dataclass(frozen=True)
 class QuadraticProgram:
-    """A convex quadratic program; see the module.
+    """The convex quadratic program of the module's formula.
 
     Attributes:
-        H, g: of the objective.
-        A, b: of the rows.
-        low, high: (n,) finite, low < high.
+        H, g: matrix and vector of the objective.
+        A, b: matrix and right side of the rows.
+        low, high: (n,) bounds of the variables, finite, low < high.
     """
 
     H: BorderedMatrix
@@ -185,13 +186,13 @@ class QuadraticProgram:
 
 @dataclass(frozen=True)
 class QuadraticAnswer:
-    """Answer of a solver of quadratic programs.
+    """Result of a solver of quadratic programs.
 
     Attributes:
-        d: (n,).
-        rows: (rows,) nonnegative multipliers.
+        d: (n,) solution.
+        rows: (rows,) nonnegative multipliers of the rows.
         bounds: (n,) multipliers of the bounds, positive for upper, negative for lower ones.
-        ending: 'infeasible' if multipliers prove it.
+        ending: how the solve ended; 'infeasible' if multipliers prove infeasibility.
     """
 
     d: Array
@@ -200,7 +201,7 @@ class QuadraticAnswer:
     ending: Ending
 
     def satisfies_optimality(self, program: QuadraticProgram) -> bool:
-        """Return True if the recomputed optimality conditions hold."""
+        """Return True if the optimality conditions of a program, recomputed here, are satisfied."""
         if not all(np.isfinite(part).all() for part in (self.d, self.rows, self.bounds)):
             return False
         bend, pull = program.H.times(self.d), program.A.transpose_times(self.rows)
@@ -218,8 +219,11 @@ class QuadraticAnswer:
 
 
 def solve_quadratic(program: QuadraticProgram) -> QuadraticAnswer | None:
-    """Solve a program, by Clarabel if the own method's answer is not optimal; None without a
-    solution.
+    """Solve a program by the own interior-point method. If its result is not optimal, solve by
+    Clarabel.
+
+    Returns:
+        The result; None if neither finds a solution.
 
     Raises:
         BridgeError: the compiled part is missing.
@@ -233,7 +237,8 @@ def solve_quadratic(program: QuadraticProgram) -> QuadraticAnswer | None:
 
 
 def solve_interior_point(program: QuadraticProgram) -> QuadraticAnswer:
-    """Iterate until the conditions hold, or multipliers prove infeasibility."""
+    """Solve a program by Mehrotra's method, until the optimality conditions hold or multipliers
+    prove infeasibility."""
     return QuadraticAnswer(*native().quadratic(program, QUADRATIC_TOLERANCE))
 
 
@@ -264,17 +269,18 @@ def solve_by_clarabel(program: QuadraticProgram) -> QuadraticAnswer:
 
 
 def convexify(H: BorderedMatrix, A: BorderedRows, b: Array) -> tuple[BorderedMatrix, Array]:
-    """Return a convex model of a Lagrangian that agrees with it where active rows hold with
-    equality.
+    """Return a convex model of a Lagrangian that agrees with it where the active rows are
+    equalities.
 
-    Active rows are added as squares (A d - b)^2 until the block of the chain is positive definite.
-    The eigenvalues of the border's Schur complement correct the rest.
+    Squares (A d - b)^2 of the active rows are added until the block of the chain is positive
+    definite. Then negative eigenvalues of the border's Schur complement are raised.
 
     Args:
-        A, b: (rows,) active rows.
+        H: Hessian of the Lagrangian.
+        A, b: active rows A d <= b.
 
     Returns:
-        The positive definite matrix, and the squares' contribution to the gradient.
+        The positive definite matrix, and the contribution of the squares to the gradient.
     """
     scale = max(1e-3, H.largest)
     square, weight = A.squares(np.ones(len(A))), scale
