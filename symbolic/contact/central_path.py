@@ -33,29 +33,30 @@ from symbolic.array import Array
 from symbolic.expression import reciprocal
 
 FINAL_WEIGHT = 1e-8
-"""Last weight of the barriers over the effort. The effort exceeds the least by at most this times
-the sum of the patches' degrees, relatively."""
+"""Final weight of the barriers over the effort. The relative excess of the effort over the least
+effort is at most this times the sum of the patches' degrees."""
 
 END_WEIGHT_FACTOR = 2.0
-"""Multiple of the final weight at which the steps end."""
+"""The steps end once the weight is below this multiple of the final weight."""
 
 CENTRING, CENTRED = 30, 1e-8
-"""Largest number of Newton steps of the barriers alone, from there onto the central path; squared
-Newton decrement over the weight at which they end."""
+"""Largest number of Newton steps on the barriers alone, from the final iterate onto the central
+path; and the squared Newton decrement over the weight at which they end."""
 
 NEWTON_STEPS = 100
-"""Largest number of such steps from any states within the cones."""
+"""Largest number of Newton steps on the barriers alone, from any states within the cones."""
 
 CENTRAL_PATH_STEPS = 30
 STEP_SHARE, LAST_SHARE, APPROACH = 0.97, 0.999, 100.0
-"""Largest share of the way to the cones' boundary in one step; the same near the end; near the end,
-the remaining share is this times the weight over the effort."""
+"""Largest share of the way to the cones' boundary in one step; the same near the end; and the
+factor that gives the share left near the end from the weight over the effort."""
 
 START_WEIGHT = 0.5
-"""Weight of a start with unknown multipliers, over the effort there per degree."""
+"""Weight at a start with unknown multipliers, over the effort per degree at this start."""
 
 BLOCK = 10
-"""Steps that are skipped together once converged: each skipped step copies the iterate."""
+"""Number of steps that are skipped together after convergence: each skipped step copies the
+iterate."""
 
 PROGRAMS = 16
 """Number of programs whose functions are cached."""
@@ -67,8 +68,8 @@ AnyExpression = TypeVar("AnyExpression", ca.SX, ca.MX)
 class ConvexProgram(Protocol):
     """A load that a set of contacts has to balance, and the cost of their wrenches.
 
-    Wrenches are scaled as in `symbolic.contact.force_closure`. `cell` holds the inputs in the order
-    of `cell_sizes`.
+    Wrenches are scaled as in `symbolic.contact.force_closure`. The argument `cell` of the methods
+    is the list of inputs in the order of `cell_sizes`.
     """
 
     @property
@@ -77,27 +78,26 @@ class ConvexProgram(Protocol):
 
     @property
     def cell_sizes(self) -> tuple[tuple[str, int], ...]:
-        """Names and sizes of the inputs."""
+        """Names and sizes of the program's inputs."""
 
     @property
     def given(self) -> dict[str, ca.SX]:
-        """Symbolic parameters in the formulas, by group; they are inputs after those of the
-        cell."""
+        """Symbolic parameters in the formulas, by group. They follow the inputs of `cell_sizes`."""
 
     def free(self, wrenches: list[ca.SX]) -> ca.SX:
         """Select the free components of all wrenches."""
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
-        """Compute all wrenches from the free components, affinely: the load determines the other
-        six."""
+        """Compute all wrenches from the free components, affinely. The load determines the other
+        six components."""
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
-        """Compute the minimised cost: a sum over the contacts, each term convex and at most
+        """Compute the minimised cost: a sum over the contacts of convex terms that are at most
         quadratic."""
 
     def start(self, cell: list[ca.SX]) -> tuple[list[ca.SX], ca.SX]:
-        """Return a start: states of all patches, well within their cones, that balance the load;
-        and the initial weight over effort per degree."""
+        """Return a start that balances the load: states of all patches well within their cones, and
+        the weight over the effort per degree."""
 
     def __hash__(self) -> int:
         """Hash by identity: compiled functions are cached by program."""
@@ -122,24 +122,25 @@ class Patch(ABC):
 
     @abstractmethod
     def centred(self, state: ca.SX, weight: ca.SX) -> ca.SX:
-        """Return an iterate with X S equal to the weight, from a state."""
+        """Return the iterate with this state and with multipliers such that X S equals the
+        weight."""
 
     @abstractmethod
     def local(self, iterate: ca.SX) -> LocalPatch:
-        """Return the derivatives that steps from an iterate need."""
+        """Return the derivatives at an iterate that steps from it need."""
 
     @abstractmethod
     def potential(self, state: ca.SX) -> ca.SX:
-        """Compute the barrier at a state; `centred` has its multipliers."""
+        """Compute the barrier at a state. Its gradient gives the multipliers of `centred`."""
 
     @abstractmethod
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
-        """Bound the least relative change of the eigenvalues of X by a change of the state, from
-        below."""
+        """Return a lower bound of the least relative change of the eigenvalues of X if the state
+        changes."""
 
     @abstractmethod
     def slack(self, state: ca.SX) -> ca.SX:
-        """Compute the slack of a state: positive inside the cone, at most zero outside."""
+        """Compute the slack of a state: positive inside the cone, zero or negative outside."""
 
     def barrier(self, state: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Compute the barrier's gradient (n,) and Hessian (n, n) at a state."""
@@ -149,8 +150,8 @@ class Patch(ABC):
         return found[0], found[1]
 
     def third(self, state: ca.SX, along: ca.SX, columns: ca.SX) -> ca.SX:
-        """Compute the barrier's third derivative (n, k) at a state, along a direction (n,) and each
-        of some columns (n, k)."""
+        """Compute the third derivative (n, k) of the barrier at a state, along a direction (n,) and
+        along each of k columns (n, k)."""
         sizes = (1, 1, columns.shape[1])
         symbol, one, others = symbols = [ca.SX.sym("s", self.state_size, k) for k in sizes]
         slope = ca.gradient(self.potential(symbol), symbol)
@@ -179,7 +180,7 @@ class NewtonStep:
 
 
 class LocalPatch(Protocol):
-    """A patch at an iterate.
+    """Derivatives of a patch at an iterate.
 
     Attributes:
         state: (n,) entries of X, the wrench first.
@@ -192,24 +193,27 @@ class LocalPatch(Protocol):
     gap: ca.SX
 
     def pull(self, weight: ca.SX, correction: ca.SX) -> ca.SX:
-        """Compute the multipliers (n,) for a weight and a correction at an unchanged state."""
+        """Compute the multipliers (n,) for a weight and a second-order correction at an unchanged
+        state."""
 
     def step(self, weight: ca.SX, correction: ca.SX, change: ca.SX) -> NewtonStep:
-        """Return the step to these multipliers with a change (n,) of the state."""
+        """Return the step with a change (n,) of the state and the multipliers for a weight and a
+        correction."""
 
 
 # --- the method ---
 
 
 def least_effort(program: ConvexProgram, *cell: ca.MX, differentiable: bool = False) -> ca.MX:
-    """Build the scaled wrenches of least effort, side by side in the order of the program's
-    patches.
+    """Build the expression of the scaled wrenches of least effort, one after the other in the order
+    of the program's patches.
 
     Args:
         cell: the program's inputs, followed by its symbolic parameters.
-        differentiable: make first derivatives exact. They are those of the central path, onto which
-            further steps move the wrenches; only the last step is differentiated. Second
-            derivatives are wrong.
+        program: the program.
+        differentiable: True for exact first derivatives. Further steps then move the wrenches onto
+            the central path, and only the last step is differentiated. Second derivatives are
+            wrong.
     """
     if differentiable:
         states, _ = barrier_step(program)(centred(program)(*cell), 1.0, *cell)
@@ -221,8 +225,8 @@ def least_effort(program: ConvexProgram, *cell: ca.MX, differentiable: bool = Fa
 
 @lru_cache(PROGRAMS)
 def central_path(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
-    """Build the function from the cell to an iterate of all patches near the central path at a
-    final weight."""
+    """Build the function from the program's inputs to an iterate of all patches near the central
+    path at the final weight."""
     cell = _mx_inputs(program)
     step = _step(program, final_weight)
     iterate = _repeated(program, step, CENTRAL_PATH_STEPS, _start(program)(*cell), cell)
@@ -231,8 +235,8 @@ def central_path(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> 
 
 @lru_cache(PROGRAMS)
 def centred(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
-    """Build the function from the cell to states of all patches on the central path, with zero
-    derivatives."""
+    """Build the function from the program's inputs to states of all patches on the central path.
+    Its derivatives are zero."""
     cell = _mx_inputs(program)
     owns = ca.vertsplit(central_path(program, final_weight)(*cell), ends_of(program))
     near = [own[: patch.state_size] for patch, own in zip(program.patches, owns, strict=True)]
@@ -245,7 +249,8 @@ def centred(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Fu
 def _repeated(
     program: ConvexProgram, step: ca.Function, most: int, iterate: ca.MX, cell: list[ca.MX]
 ) -> ca.MX:
-    """Repeat a step at most `most` times, in whole blocks, while its flag says so."""
+    """Repeat a step, in whole blocks and at most `most` times, as long as its flag asks for
+    more."""
     held = [ca.MX.sym("iterate", iterate.shape[0]), ca.MX.sym("goes_on")]
     inputs = [*held, *_mx_inputs(program)]
     keep = ca.Function("keep", inputs, held)
@@ -263,7 +268,8 @@ def _repeated(
 
 @lru_cache(PROGRAMS)
 def _step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
-    """Build a step: iterate, unused flag and cell to the next iterate and a flag to continue."""
+    """Build a step of the method: a function from iterate, an unused flag and the inputs to the
+    next iterate and a flag that asks for more."""
     iterate, cell = ca.SX.sym("iterate", ends_of(program)[-1]), _sx_inputs(program)
     owns = zip(program.patches, ca.vertsplit(iterate, ends_of(program)), strict=True)
     local = [patch.local(own) for patch, own in owns]
@@ -297,8 +303,11 @@ def _step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Func
 
 @lru_cache(PROGRAMS)
 def barrier_step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
-    """Build a Newton step of the barriers alone, from states to states of the final weight. On the
-    central path, its derivatives by the cell are those of the path. Inputs as of `_step`."""
+    """Build a Newton step on the barriers alone, from states to states of the final weight.
+
+    On the central path, its derivatives by the inputs are the derivatives of the path. Like `_step`
+    it takes an unused flag and returns a flag that asks for more.
+    """
     states, cell = ca.SX.sym("states", state_ends(program)[-1]), _sx_inputs(program)
     owns = ca.vertsplit(states, state_ends(program))
     weight, pulls, equations = barrier_equations(program, owns, cell, final_weight)
@@ -314,8 +323,8 @@ def barrier_step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> 
 def barrier_equations(
     program: ConvexProgram, states: list[ca.SX], cell: list[ca.SX], final_weight: float
 ) -> tuple[ca.SX, list[ca.SX], Equations]:
-    """Return the weight, the barriers' multipliers at it, and Newton's equations of effort and
-    barriers."""
+    """Return the weight, the barriers' multipliers at this weight, and Newton's equations of effort
+    and barriers."""
     weight = final_weight * program.effort(wrenches_of(program, states), cell)
     patches = zip(program.patches, states, strict=True)
     slopes, curvatures = zip(*[patch.barrier(own) for patch, own in patches], strict=True)
@@ -326,13 +335,14 @@ def barrier_equations(
 def central_point(
     program: ConvexProgram, states: Array, cell: list[Array], share: float
 ) -> tuple[Array, Array]:
-    """Compute states (n,) on the central path, and their derivatives (n, m) by the program's first
-    input (m,).
+    """Compute states (n,) of all patches on the central path, and their derivatives (n, m) by the
+    program's first input (m,).
 
     Args:
-        states: (n,) of all patches, within their cones, that balance the load.
-        cell: the inputs.
-        share: the weight over effort per degree.
+        program: the program.
+        states: (n,) initial states within the cones that balance the load.
+        cell: the program's inputs.
+        share: weight over the effort per degree.
     """
     final_weight = share / degree_of(program)
     step = barrier_step(program, final_weight)
@@ -348,13 +358,15 @@ def central_point(
 
 
 def _length(lowest: list[ca.SX], share: ca.SX | float) -> ca.SX:
-    """Compute the length of a step: at most one, and at most a share of the way to the boundary."""
+    """Compute the length of a step: at most one, and at most a share of the way to the cones'
+    boundary."""
     return ca.fmin(1.0, share / ca.fmax(-minimum(lowest), share))
 
 
 @lru_cache(PROGRAMS)
 def _start(program: ConvexProgram) -> ca.Function:
-    """Build the program's start as an iterate on the central path of a similar problem."""
+    """Build the function from the inputs to the program's start, as an iterate on the central path
+    of a similar problem."""
     cell = _sx_inputs(program)
     states, share = program.start(cell)
     effort = program.effort(wrenches_of(program, states), cell)
@@ -368,7 +380,7 @@ def _start(program: ConvexProgram) -> ca.Function:
 
 
 def minimum(values: list[ca.SX]) -> ca.SX:
-    """Return the least of some values."""
+    """Return the expression of the least of several values."""
     found = values[0]
     for value in values[1:]:
         found = ca.fmin(found, value)
@@ -376,19 +388,19 @@ def minimum(values: list[ca.SX]) -> ca.SX:
 
 
 def symmetric(rows: Sequence[Sequence[ca.SX]]) -> ca.SX:
-    """Build a symmetric matrix (n, n) from its rows, each up to the diagonal."""
+    """Build a symmetric matrix (n, n) from the rows of its lower triangle."""
     n = range(len(rows))
     columns = [ca.vertcat(*[rows[max(i, j)][min(i, j)] for i in n]) for j in n]
     return ca.horzcat(ca.SX(len(rows), 0), *columns)
 
 
 class Factors:
-    """Factors L D L' of the first k unknowns of a symmetric matrix, by default all; zeros cost
-    nothing.
+    """Factors L D L' of the first k unknowns of a symmetric matrix, by default of all. Structural
+    zeros are skipped.
 
     Attributes:
-        schur_complement: (n - k, n - k) matrix of the other unknowns after elimination of the
-            first.
+        schur_complement: (n - k, n - k) matrix of the other unknowns after elimination of the first
+            k.
     """
 
     def __init__(self, matrix: ca.SX, k: int | None = None) -> None:
@@ -409,7 +421,7 @@ class Factors:
         self.schur_complement = symmetric([rows[i][rest.start :] for i in rest])
 
     def forward(self, right: ca.SX) -> ca.SX:
-        """Eliminate the first unknowns from a right side (n,)."""
+        """Eliminate the first k unknowns from a right side (n,)."""
         found = ca.vertsplit(right)
         for p, below in enumerate(self._below):
             for i, share in below.items():
@@ -417,8 +429,7 @@ class Factors:
         return ca.vertcat(*found)
 
     def backward(self, reduced: ca.SX, others: ca.SX | None = None) -> ca.SX:
-        """Compute the unknowns (n,) from the result of `forward` and the other unknowns (n -
-        k,)."""
+        """Compute all unknowns (n,) from the result of `forward` and the n - k other unknowns."""
         first = ca.vertsplit(reduced)[: len(self._below)]
         found = [value * over for value, over in zip(first, self._over_pivot, strict=True)]
         found += [] if others is None else ca.vertsplit(others)
@@ -429,13 +440,15 @@ class Factors:
 
 
 class Equations:
-    """Newton's equations of a program. States beside the wrenches are eliminated first, patch by
-    patch; then the free components of the wrenches are solved for.
+    """Newton's equations of a program at given states.
+
+    Entries of the states that are not wrenches are eliminated first, patch by patch. Then the
+    equations are solved for the free components of the wrenches.
 
     Attributes:
-        effort: at the states.
+        effort: effort at the states.
         missing: (n,) change of the states that balances the load.
-        slope, curvature: (n,) and (n, n) derivatives of the effort.
+        slope, curvature: (n,) and (n, n) first and second derivatives of the effort by the states.
     """
 
     def __init__(
@@ -444,8 +457,10 @@ class Equations:
         """Factor the equations.
 
         Args:
-            states: (m,) of each patch.
-            stiffness: (m, m) of each patch.
+            program: the program.
+            cell: the program's inputs.
+            states: (m,) state of each patch.
+            stiffness: (m, m) stiffness of each patch.
         """
         self._ends = [0, *accumulate(state.shape[0] for state in states)]
         starts = zip(self._ends, program.patches, strict=False)
@@ -465,24 +480,25 @@ class Equations:
         )
 
     def decrement(self, pulls: list[ca.SX], changes: list[ca.SX]) -> ca.SX:
-        """Compute the squared Newton decrement times the weight, for multipliers and the changes
-        that follow."""
+        """Compute the squared Newton decrement times the weight, from the patches' multipliers and
+        the changes of their states."""
         return ca.dot(ca.vertcat(*pulls) - self.slope, ca.vertcat(*changes))
 
     def changes(self, pulls: list[ca.SX]) -> list[ca.SX]:
-        """Compute the changes (m,) of each patch's state for its multipliers (m,)."""
+        """Compute the changes (m,) of each patch's state that follow from its multipliers (m,)."""
         pull = ca.vertcat(*pulls) - self.slope - ca.mtimes(self._stiff, self.missing)
         found: list[ca.SX] = ca.vertsplit(self.missing + self.balanced_change(pull), self._ends)
         return found
 
     def constrained(self, moved: ca.SX) -> ca.SX:
-        """Compute the changes (n, k) of states whose dependent components move by (n, k); the free
-        components minimise effort and barriers."""
+        """Compute changes (n, k) of the states from given changes (n, k) of the dependent
+        components. The free components minimise effort and barriers."""
         pulls = ca.horzsplit(-ca.mtimes(self._stiff, moved))
         return moved + ca.horzcat(*map(self.balanced_change, pulls))
 
     def balanced_change(self, pull: ca.SX) -> ca.SX:
-        """Compute the change (n,) for multipliers (n,) that keeps the load balanced."""
+        """Compute the change (n,) of the states for multipliers (n,) that keeps the load
+        balanced."""
         reduced, found = self._first.forward(pull[self._order]), ca.SX(*pull.shape)
         left = self._last.forward(ca.mtimes(self._by_free.T, reduced[-len(self._wrench) :]))
         wrenches = ca.mtimes(self._by_free, self._last.backward(left))
@@ -493,7 +509,7 @@ class Equations:
 def effort_derivatives(
     program: ConvexProgram, states: list[ca.SX], cell: list[ca.SX]
 ) -> list[ca.SX]:
-    """Compute the effort at states, its gradient (n,) and Hessian (n, n)."""
+    """Compute the effort at states, and its gradient (n,) and Hessian (n, n)."""
     symbols = [ca.SX.sym("state", state.shape[0]) for state in states]
     effort, whole = program.effort(wrenches_of(program, symbols), cell), ca.vertcat(*symbols)
     by = [effort, *ca.hessian(effort, whole)[::-1]]
@@ -502,18 +518,18 @@ def effort_derivatives(
 
 
 def _mx_inputs(program: ConvexProgram) -> list[ca.MX]:
-    """Return MX symbols for the cell and the symbolic parameters."""
+    """Return MX symbols for the program's inputs and the symbolic parameters."""
     given = ((name, numbers.numel()) for name, numbers in program.given.items())
     return [ca.MX.sym(name, size) for name, size in (*program.cell_sizes, *given)]
 
 
 def _sx_inputs(program: ConvexProgram) -> list[ca.SX]:
-    """Return SX symbols for the cell without the symbolic parameters."""
+    """Return SX symbols for the program's inputs, without the symbolic parameters."""
     return [ca.SX.sym(name, size) for name, size in program.cell_sizes]
 
 
 def wrenches_of(program: ConvexProgram, owns: list[AnyExpression]) -> list[AnyExpression]:
-    """Select the wrenches at the beginning of the patches' states or iterates."""
+    """Select the wrench at the beginning of each patch's state or iterate."""
     return [own[: patch.wrench_size] for patch, own in zip(program.patches, owns, strict=True)]
 
 
@@ -523,10 +539,11 @@ def degree_of(program: ConvexProgram) -> float:
 
 
 def ends_of(program: ConvexProgram) -> list[int]:
-    """Return the first entry of each patch in an iterate, and the iterate's size."""
+    """Return the index of the first entry of each patch in an iterate, then the iterate's size."""
     return [0, *accumulate(patch.iterate_size for patch in program.patches)]
 
 
 def state_ends(program: ConvexProgram) -> list[int]:
-    """Return the first entry of each patch in the states of all patches, and their size."""
+    """Return the index of the first entry of each patch in the states of all patches, then their
+    size."""
     return [0, *accumulate(patch.state_size for patch in program.patches)]

@@ -1,15 +1,15 @@
-"""Elastic layers between the payload and arms that keep their poses: their shares of a load, and
-the resulting shift of the pressure.
+"""Elastic layers between the payload and arms that keep their poses: how they share a load, and how
+the pressure shifts.
 
 Each pad is a layer of springs with equal stiffness over its area. The payload moves by six numbers
-until all layers together balance the load. With a pad's stiffness K_i and the map A_i from its
-wrench to one about the box frame, its share is K_i A_i^T (sum_j A_j K_j A_j^T)^-1 of the load: a
-constant matrix.
+until all layers together balance the load. Pad i has the stiffness K_i; A_i maps its wrench to a
+wrench about the box frame. Its share of the load is K_i A_i^T (sum_j A_j K_j A_j^T)^-1, a constant
+matrix.
 
 Evenly pressing pads (`symbolic.contact.soft_finger`) are a limit: the box on a soft layer turns a
-little relative to the arms, and its pressure tilts. The layer's moments about its tangents shift
-its centre of pressure. A shift of a quarter of a disc's radius, of half a cup's, or of a third of a
-rectangle's half side, makes the pressure at a rim vanish.
+little relative to the arms, and the pressure tilts. The layer's moments about its tangents shift
+its centre of pressure. The pressure at a rim vanishes at a shift of a quarter of a disc's radius,
+of half a cup's radius, or of a third of a rectangle's half side.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from symbolic.contact.force_closure import wrench_to_box
 from symbolic.records import Contact, Workcell
 
 SHEAR = 1.0 / 3.0
-"""Stiffness of a layer along it over that across it: rubber keeps its volume."""
+"""Tangential stiffness of a layer over its normal stiffness. Rubber keeps its volume."""
 
 
 def layer_shares(pads: Sequence[Contact]) -> Array:
-    """Compute the matrices (n, 6, 6) from a load to its shares, the wrenches of n pads.
+    """Compute the matrices (n, 6, 6) that map a load to the wrenches of n pads.
 
-    The load is force and moment about the box frame's origin, box axes; a wrench is that of the pad
-    on the payload about the pad's place, in the pad's axes [N, N m].
+    The load is force and moment about the box frame's origin, along the box's axes. A wrench acts
+    from the pad on the payload, about the pad's place, along the pad's axes [N, N m].
     """
     maps, stiff = [wrench_to_box(pad) for pad in pads], [layer_stiffness(pad) for pad in pads]
     whole = sum(A @ K @ A.T for A, K in zip(maps, stiff, strict=True))
@@ -39,12 +39,12 @@ def layer_shares(pads: Sequence[Contact]) -> Array:
 
 
 def pressure_shifts(workcell: Workcell, load: Array, normal: Array) -> Array:
-    """Compute the shifts (n, 2) of the centres of pressure over the shifts at which the pressure at
-    a rim vanishes; the largest of a robot's pads.
+    """Compute for each robot how far its centres of pressure shift, over the shift at which the
+    pressure at a rim vanishes: (n, 2), the largest of the robot's pads.
 
     Args:
-        workcell: its pads share each robot's normal force in proportion to their areas.
-        load: (n, 6) force and moment about the box frame's origin, box axes [N, N m].
+        workcell: cell whose pads share each robot's normal force in proportion to their areas.
+        load: (n, 6) force and moment about the box frame's origin, along the box's axes [N, N m].
         normal: (n, 2) normal forces of the robots [N].
     """
     pads, robots = workcell.pads, workcell.pad_robots
@@ -63,14 +63,14 @@ def pressure_shifts(workcell: Workcell, load: Array, normal: Array) -> Array:
 
 
 def free_shift(pad: Contact) -> float:
-    """Compute the shift of a pad's centre of pressure at which the pressure at a rim vanishes
-    [m]."""
+    """Compute the smallest shift of a pad's centre of pressure at which the pressure at a rim
+    vanishes [m]."""
     return float(min(kern(pad)))
 
 
 def kern(pad: Contact) -> tuple[Any, Any]:
-    """Compute the shifts along a pad's axes at which the pressure at a rim vanishes, numbers or
-    symbols [m]."""
+    """Compute the shifts [m] along both axes of a pad at which the pressure at a rim vanishes. They
+    are numbers, or symbols if the pad's lengths are."""
     if pad.half_sides is None:
         share = 2.0 if pad.is_ring else 4.0
         return pad.patch_radius / share, pad.patch_radius / share
@@ -78,8 +78,8 @@ def kern(pad: Contact) -> tuple[Any, Any]:
 
 
 def layer_stiffness(pad: Contact) -> Array:
-    """Compute the stiffness (6, 6) of a pad's layer, in its axes, over the normal stiffness per
-    area."""
+    """Compute the stiffness (6, 6) of a pad's layer along the pad's axes, over its normal stiffness
+    per area."""
     area = pad.area
     # Means of the squared coordinates: the side, or the radius of a ring or a disc, times the kern.
     if pad.half_sides is None:

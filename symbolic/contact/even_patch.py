@@ -6,10 +6,10 @@ most f = grip lever(grip / N). f is concave and of degree one, so that
 
     -log(f^2 - M^2)
 
-is a barrier of degree 2. The cone is not one of positive semidefinite matrices and its dual has no
-closed form, so that steps use the barrier alone. An iterate has the state x, multipliers z and the
-weight w at which z should be -w grad; the distance of z from that shows whether the iterate is near
-the central path. With the barrier's second and third derivatives H and T,
+is a barrier of degree 2. The cone is not a cone of positive semidefinite matrices and its dual has
+no closed form, so steps use the barrier alone. An iterate has the state x, multipliers z and a
+weight w. On the central path z = -w grad; the distance of z from this value shows how near the path
+the iterate is. With the barrier's second and third derivatives H and T,
 
     z + dz = -weight grad - w H dx - correction,   correction = w / 2 T[dx, dx] - w H dx.
 
@@ -30,20 +30,21 @@ from symbolic.contact.soft_finger import SoftPatch, torsion_capacity
 DEGREE = 2.0
 
 CHORDS = 5
-"""Secant steps on the concave slack along a step; each ends within the cone."""
+"""Number of secant steps on the concave slack along a step. Each ends within the cone."""
 
 LEAST_LENGTH = 1e-12
-"""Least length of a step."""
+"""Smallest length of a step."""
 
 NEAR_PATH, OFF_PATH = 0.1, 0.6
-"""Distances of the multipliers from the barrier's, in its Hessian's norm: a step aims freely below
-the first one, and back at the central path above the second one."""
+"""Distances of the multipliers from the barrier's, in the norm of its Hessian. Below the first a
+step aims freely; above the second it aims back at the central path."""
 
 LEAST_TRUST = 1e-3
-"""Share of the way that a step above the second distance may aim at."""
+"""Share of the way to the boundary that a step far from the central path may aim at."""
 
 SAFE = 0.9
-"""Largest share of the way to the boundary in one step: Newton's method leaves it slowly."""
+"""Largest share of the way to the boundary in one step: Newton's method leaves the boundary
+slowly."""
 
 
 @dataclass(frozen=True)
@@ -59,21 +60,22 @@ class EvenPatch(Patch):
     iterate_size, degree = 2 * len(EVEN) + 1, DEGREE
 
     def centred(self, state: ca.SX, weight: ca.SX) -> ca.SX:
-        """See `symbolic.contact.central_path.Patch`."""
+        """Return the iterate with this state and the multipliers -weight times the barrier's
+        gradient."""
         return ca.vertcat(state, -weight * self.barrier(state)[0], weight)
 
     def local(self, iterate: ca.SX) -> LocalEven:
-        """See `symbolic.contact.central_path.Patch`."""
+        """Return the barrier's derivatives at an iterate."""
         return LocalEven(self, iterate)
 
     def potential(self, state: ca.SX) -> ca.SX:
-        """See `symbolic.contact.central_path.Patch`."""
+        """Compute the barrier -log(f^2 - M^2) at a state."""
         grip = ca.sqrt(self._grip_squared(state))
         return -ca.log(torsion_capacity(grip, state[1:3], self.shape)[0] ** 2 - state[3] ** 2)
 
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
-        """Compute -1 / t for a length t of the change that stays within the cone; t is nearly the
-        longest."""
+        """Return -1 / t for a length t of the change that stays within the cone. t is nearly the
+        longest such length."""
         # The friction limit: the lower eigenvalue of (N, T).
         square = self._grip_squared(state)
         mean = (state[0] * change[0] - ca.dot(state[1:3], change[1:3])) / square
@@ -89,7 +91,8 @@ class EvenPatch(Patch):
         return -1.0 / ca.fmax(near, LEAST_LENGTH)
 
     def slack(self, state: ca.SX) -> ca.SX:
-        """Compute the remaining torsion, or the missing friction as a negative number."""
+        """Compute the remaining torsion of a state, or the missing friction as a negative
+        number."""
         grip = ca.sqrt(ca.fmax(self._grip_squared(state), 0.0))
         torsion = torsion_capacity(grip, state[1:3], self.shape)[0] - ca.fabs(state[3])
         friction = state[0] - ca.sqrt(ca.sumsqr(state[1:3]))
@@ -101,16 +104,17 @@ class EvenPatch(Patch):
 
 
 class LocalEven:
-    """See `symbolic.contact.central_path.LocalPatch`.
+    """Derivatives of an `EvenPatch` at an iterate.
 
     Attributes:
-        slope, curvature: (4,) and (4, 4) derivatives of the barrier.
-        stored, weight: weight of the iterate, and the one that is used.
+        slope, curvature: (4,) and (4, 4) first and second derivatives of the barrier.
+        stored, weight: weight of the iterate, and the weight that steps use.
         trust: share of the way to the boundary that a step may aim at.
     """
 
     def __init__(self, patch: EvenPatch, iterate: ca.SX) -> None:
-        """Compute the barrier's derivatives. The weight is at least that of the multipliers."""
+        """Compute the barrier's derivatives. The weight is at least the weight that the multipliers
+        imply."""
         self.patch = patch
         self.state, self.multiplier, weight = ca.vertsplit(
             iterate, [0, len(EVEN), 2 * len(EVEN), patch.iterate_size]
@@ -127,11 +131,13 @@ class LocalEven:
         self.trust = ca.fmin(ca.fmax(near, LEAST_TRUST), 1.0)
 
     def pull(self, weight: ca.SX, correction: ca.SX) -> ca.SX:
-        """See `symbolic.contact.central_path.LocalPatch`."""
+        """Compute the multipliers (4,) for a weight and a second-order correction at an unchanged
+        state."""
         return -weight * self.slope - correction
 
     def step(self, weight: ca.SX, correction: ca.SX, change: ca.SX) -> NewtonStep:
-        """See `symbolic.contact.central_path.LocalPatch`."""
+        """Return the step with a change (4,) of the state and the multipliers for a weight and a
+        correction."""
         lowest, grown = self.patch.lowest(self.state, change), weight - self.stored
         of_state = lowest / self.trust
         left = self.pull(weight, correction) - ca.mtimes(self.stiffness, change)

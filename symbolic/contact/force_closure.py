@@ -1,15 +1,15 @@
 """Force closure: whether pads with any normals can hold a payload under every motion.
 
-They can if an internal squeeze exists that lies strictly within every patch's cone (Bicchi and
-Kumar, Robotic grasping and contact: a review, ICRA 2000): enough of it balances any load.
+They can if an internal squeeze exists that lies strictly within every patch's cone: enough squeeze
+then balances any load (Bicchi and Kumar, Robotic grasping and contact: a review, ICRA 2000).
 
-Pads press evenly (`symbolic.contact.soft_finger`), so that the only moment of a pad is torsion
-about its normal. Its state, in its axes, z into the payload, is N, T / mu and M / (mu r): normal
-force N, tangential force T (2,), moment M about the normal through the patch's centre, and r the
-patch's radius or half diagonal.
+Pads press evenly (`symbolic.contact.soft_finger`), so the only moment of a pad is torsion about its
+normal. The state of a pad, along its axes with z into the payload, is N, T / mu and M / (mu r):
+normal force N, tangential force T (2,), moment M about the normal through the patch's centre, and r
+the patch's radius or half diagonal.
 
-`derive_grasp_numbers` derives the constants in formulas of such pads: the squeeze to start from,
-and the maps that balance a load.
+`derive_grasp_numbers` computes the constants in the formulas of such pads: the initial squeeze, and
+the maps that balance a load.
 """
 
 from __future__ import annotations
@@ -30,40 +30,46 @@ from symbolic.records.poses import box_rotation, skew
 from symbolic.records.quantities import GRAVITY
 
 WRENCH_SIZE = 6
-"""Entries of a pad's wrench: N, T (2,) [N], the first moment of the pressure (2,) and M [N m]."""
+"""Number of entries of a pad's wrench: N, T (2,) [N], the first moment of the pressure (2,) and M
+[N m]."""
 
 EVEN = (0, 1, 2, 5)
-"""Nonzero entries of a wrench of a patch under even pressure: its state."""
+"""Indices of the entries of a wrench that a patch under even pressure can bear. They form its
+state."""
 
 TANGENTIAL = (1, 2, 3)
-"""Entries of a state that are borne by friction."""
+"""Indices of the entries of a state that friction bears."""
 
 DIRECTIONS, TORSIONS = 24, 4
-"""Directions of friction, and shares of it in every direction, that sample a patch's cone."""
+"""Number of directions of friction, and of shares of torsion in each direction, with which a
+patch's cone is sampled."""
 
 CLOSURE_NEWTON_STEPS = 100
 BALANCED = 1e-6
-"""Newton decrement at which the search ends; a projection then removes the residual load."""
+"""Newton decrement at which the search for weights ends. A projection then removes the residual
+load."""
 
 LEAST_SQUEEZE_SHARE = 0.05
-"""Least share of the friction at which a squeeze is sought."""
+"""Least share of the friction for which a squeeze is sought."""
 
 SQUEEZE_BISECTIONS = 6
 
 PARALLEL = 1.0 - 1e-6
-"""Cosine of the angle between two normals that count as equal."""
+"""Two normals count as equal if the cosine of the angle between them exceeds this."""
 
 SPARE_FRICTION = 0.95
-"""Share of their friction with which pads must close their grasp."""
+"""Share of their friction with which pads have to close their grasp."""
 
 LOAD_SIZE = 6
-"""Force and moment about the box frame's origin, along the box's axes [N, N m]."""
+"""Number of entries of a load: force and moment about the box frame's origin, along the box's axes
+[N, N m]."""
 
 MOMENT_ARM = 0.1
-"""Lever of moments in the load's scale [m]: about half a payload, so they count like forces."""
+"""Lever that converts moments to forces in the scale of a load [m]: about half a payload."""
 
 LEAST_NEW = 0.1
-"""Least share of a component's effect outside the span of earlier ones to select it."""
+"""A component is selected if this share of its effect lies outside the span of the components
+selected before."""
 
 
 @dataclass(frozen=True)
@@ -81,10 +87,11 @@ class InternalForce:
 
 
 def closing_squeeze(workcell: Workcell) -> InternalForce | None:
-    """Find an internal squeeze of the grasp; return None if `SPARE_FRICTION` does not close it.
+    """Find an internal squeeze of the grasp; None if it is not closed with the share
+    `SPARE_FRICTION` of the friction.
 
-    The squeeze is found for the geometric mean of two frictions: the nominal friction and the least
-    friction that closes the grasp.
+    The squeeze is found for the geometric mean of the nominal friction and the least friction that
+    closes the grasp.
     """
     if _balanced_states(workcell, SPARE_FRICTION) is None:
         return None
@@ -104,16 +111,17 @@ def closing_squeeze(workcell: Workcell) -> InternalForce | None:
 
 
 def has_force_closure(workcell: Workcell) -> bool:
-    """Return True if a workcell's pads hold its payload under every motion."""
+    """Return True if a workcell's pads can hold the payload under every motion."""
     return _balanced_states(workcell, SPARE_FRICTION) is not None
 
 
 def equal_pressure_rows(workcell: Workcell) -> Array:
-    """Return the matrix (k, pads) whose product with the pads' normal forces is zero.
+    """Return the matrix (k, pads) of the conditions for equal pressure: its product with the pads'
+    normal forces is zero.
 
-    Each row states that two pads of one arm with the same normal press with equal pressure: the arm
-    keeps the orientation of their common plane. Pads with different normals press as the motion
-    requires.
+    Each row states that two pads of one arm with the same normal press with equal pressure, because
+    the arm keeps the orientation of their common plane. Pads with different normals press as the
+    motion requires.
     """
     pads, robots, rows = workcell.pads, workcell.pad_robots, []
     for k in range(1, len(pads)):
@@ -127,12 +135,13 @@ def equal_pressure_rows(workcell: Workcell) -> Array:
 
 
 def balance_maps(workcell: Workcell, in_units: bool = False) -> list[Array]:
-    """Return, for each pad, the matrix (6 + k, 4) from its state to the balanced quantities: force
-    and moment about the box frame's origin, along the box's axes, then the rows of
+    """Return for each pad the matrix (6 + k, 4) from its state to the balanced quantities: force
+    and moment about the box frame's origin, along the box's axes, then the k rows of
     `equal_pressure_rows`.
 
     Args:
-        in_units: for states in newtons and newton metres, without friction and radius.
+        workcell: the workcell.
+        in_units: True for states in newtons and newton metres, not scaled by friction and radius.
     """
     alike, found = equal_pressure_rows(workcell), []
     for i, pad in enumerate(workcell.pads):
@@ -146,8 +155,8 @@ def balance_maps(workcell: Workcell, in_units: bool = False) -> list[Array]:
 
 
 def _balanced_states(workcell: Workcell, share: float) -> tuple[Array, ...] | None:
-    """Find states within the cones at a share of the friction, whose wrenches sum to zero. They are
-    sums of points on the cones' boundaries with positive weights."""
+    """Find states within the cones, at a share of the friction, whose wrenches sum to zero; None if
+    there are none. They are sums of points on the cones' boundaries with positive weights."""
     maps = balance_maps(workcell)
     lessened = [_with_friction(_generators(pad), share) for pad in workcell.pads]
     columns = np.vstack([rows @ A.T for rows, A in zip(lessened, maps, strict=True)])
@@ -163,11 +172,11 @@ def _balanced_states(workcell: Workcell, share: float) -> tuple[Array, ...] | No
 
 
 def _weights(columns: Array) -> Array | None:
-    """Find positive weights (n,) with sum one and zero weighted sum of the rows a_j of `columns`
-    (n, m), else None.
+    """Find positive weights (n,) with sum one for which the weighted sum of the rows a_j of
+    `columns` (n, m) is zero; None if there are none.
 
-    The analytic centre of the polytope 1 + a_j . y > 0 exists if and only if such weights do. The
-    weights are proportional to 1 / (1 + a_j . y) there.
+    Such weights exist exactly if the polytope 1 + a_j . y > 0 has an analytic centre. At the centre
+    they are proportional to 1 / (1 + a_j . y).
     """
     if np.linalg.matrix_rank(columns) < columns.shape[1]:
         return None
@@ -186,7 +195,7 @@ def _weights(columns: Array) -> Array | None:
 
 def state_to_box(contact: Contact) -> Array:
     """Return the matrix (6, 4) from a patch's state to force and moment about the box frame's
-    origin, box axes."""
+    origin, along the box's axes."""
     mu, r = contact.friction, contact.patch_radius
     local = np.zeros((WRENCH_SIZE, WRENCH_SIZE))
     local[[0, 1, 2], [1, 2, 0]] = mu, mu, 1.0
@@ -196,8 +205,8 @@ def state_to_box(contact: Contact) -> Array:
 
 
 def wrench_to_box(contact: Contact) -> Array:
-    """Return the matrix (6, 6) from a wrench about a pad's centre, in its axes, to one about the
-    box frame."""
+    """Return the matrix (6, 6) from a wrench about a pad's centre, along the pad's axes, to the
+    wrench about the box frame's origin."""
     R, p = contact.T_box_pad[:3, :3], contact.T_box_pad[:3, 3]
     return np.block([[R, np.zeros((3, 3))], [skew(p) @ R, R]])
 
@@ -209,8 +218,8 @@ def _with_friction(states: Array, share: float) -> Array:
 
 
 def scaled_patch(contact: Contact) -> SoftPatch:
-    """Return a contact's patch with lengths over its radius, in its own axes; equal for all
-    discs."""
+    """Return the patch of a contact with lengths over its radius, along its own axes. It is the
+    same for all discs."""
     if contact.half_sides is None:
         return SoftPatch(2.0 / 3.0, np.eye(2))
     own = SoftPatch.of(contact, contact.T_box_pad[:3, :3])
@@ -218,7 +227,7 @@ def scaled_patch(contact: Contact) -> SoftPatch:
 
 
 def _generators(contact: Contact) -> Array:
-    """Return states (n, 4) on the boundary of a patch's cone that span it, each with N = 1."""
+    """Return states (n, 4) with N = 1 on the boundary of a patch's cone that span the cone."""
     patch, rows = scaled_patch(contact), []
     for angle in 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
         for share in np.linspace(0.0, 1.0, TORSIONS + 1)[:-1]:
@@ -233,11 +242,11 @@ def _generators(contact: Contact) -> Array:
 
 
 def dependent_components(workcell: Workcell) -> tuple[int, ...]:
-    """Select the components of the states that the others and the load determine: the first ones
-    that reach every load, forces before moments.
+    """Select the components of the states that the load and the other components determine. They
+    are the first ones that together balance every load, forces before moments.
 
-    The choice depends on neither friction nor sizes, and is stable under small displacements of
-    pads; pivots of nearly equal size would not be.
+    The choice depends on neither friction nor sizes, and it is stable under small displacements of
+    pads. Pivots of nearly equal size would not be.
     """
     effects = np.hstack(balance_maps(workcell, in_units=True)).astype(float)
     effects[3:LOAD_SIZE] /= MOMENT_ARM
@@ -250,8 +259,8 @@ def dependent_components(workcell: Workcell) -> tuple[int, ...]:
 
 
 def _new_columns(matrix: Array, order: Sequence[int], least: float) -> list[int]:
-    """Select columns, in an order, whose part outside the span of the earlier ones is longer than
-    `least`."""
+    """Select columns of a matrix in a given order. A column is selected if its part outside the
+    span of the columns selected before is longer than `least`."""
     taken: list[int] = []
     span = np.zeros((len(matrix), 0))
     for k in order:
@@ -264,10 +273,12 @@ def _new_columns(matrix: Array, order: Sequence[int], least: float) -> list[int]
 
 
 def derive_grasp_numbers(workcell: Workcell, reach: float = 1.0) -> GraspNumbers:
-    """Derive the constants of a grasp, except its states at rest.
+    """Compute the constants of a grasp, except its states at rest.
 
     Args:
-        reach: size of the patches that the squeeze has to lie within, over the cell's own.
+        workcell: the workcell.
+        reach: size of the patches within which the squeeze has to lie, over the size of the cell's
+            patches.
 
     Raises:
         SettingsError: no internal squeeze exists.
@@ -301,7 +312,8 @@ def derive_grasp_numbers(workcell: Workcell, reach: float = 1.0) -> GraspNumbers
 
 
 def grasp_shapes(workcell: Workcell) -> dict[str, Any]:
-    """Return the shapes of all arrays of `GraspNumbers`; `shapes` has one per pad."""
+    """Return the shapes of all arrays of `GraspNumbers`; the entry `shapes` has one shape per
+    pad."""
     pads = workcell.pads
     b, n = len(dependent_components(workcell)), len(EVEN) * len(pads)
     return {
@@ -319,8 +331,8 @@ def grasp_shapes(workcell: Workcell) -> dict[str, Any]:
 
 
 def _shape(pad: Contact) -> Array:
-    """Return the mean distance and the spread of a rectangular patch over its radius; empty for a
-    disc."""
+    """Return the mean distance and the spread of a rectangular patch over its radius; an empty
+    array for a disc."""
     if pad.half_sides is None:
         return np.zeros(0)
     patch = scaled_patch(pad)
@@ -337,7 +349,7 @@ def least_distance(workcell: Workcell) -> float:
 
 
 def smaller_patches(workcell: Workcell, share: float) -> Workcell:
-    """Return the cell with smaller patches at the same places."""
+    """Return the cell with all patches smaller by a factor `share`, at the same places."""
 
     def smaller(contact: Contact) -> Contact:
         sides = contact.half_sides
@@ -353,8 +365,8 @@ def smaller_patches(workcell: Workcell, share: float) -> Workcell:
 
 
 def robot_wrenches(workcell: Workcell) -> Array:
-    """Return the matrix (6, 6 k) from all pads' wrenches, see `grasp_wrenches`, to force and moment
-    of the first robot about its nominal contact point, along the axes of contact 1."""
+    """Return the matrix (6, 6 k) from the wrenches of all k pads to the wrench of the first robot:
+    force and moment about its nominal contact point, along the axes of contact 1."""
     axes, columns = workcell.contacts[0].T_box_pad[:3, :3], []
     for pad, robot in zip(workcell.pads, workcell.pad_robots, strict=True):
         force, moment = np.zeros((2, 3, WRENCH_SIZE))
@@ -370,7 +382,8 @@ def robot_wrenches(workcell: Workcell) -> Array:
 
 
 def _load_at_rest(workcell: Workcell) -> Array:
-    """Return the load (6,) of the payload at rest at the start, divided by the load's scale."""
+    """Return the load (6,) of the payload at rest in its start pose, divided by the load's
+    scale."""
     turn = box_rotation(workcell.task.orientation, workcell.task.waypoints[0].lower)
     force = -turn.T @ np.array(GRAVITY)
     moment = np.cross(workcell.payload.centre_of_mass, force)
@@ -379,5 +392,5 @@ def _load_at_rest(workcell: Workcell) -> Array:
 
 
 def _cleaned(matrix: Array) -> Array:
-    """Set entries that are zero but for rounding to zero."""
+    """Return a matrix with entries that are zero up to rounding set to zero."""
     return np.where(np.abs(matrix) < 1e-14 * np.abs(matrix).max(), 0.0, matrix)

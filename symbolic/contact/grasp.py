@@ -3,8 +3,8 @@
     minimise the sum of all |f_i|^2  subject to  the wrenches balance the load of the motion,
                                                  each lies within its patch's cone
 
-`symbolic.contact.central_path` solves it. The paper (Eqs. 38-42, 51-59) minimises the forces first
-and balances the moment afterwards. The method starts from an internal squeeze
+`symbolic.contact.central_path` solves this program. (The paper, Eqs. 38-42 and 51-59, minimises the
+forces first and balances the moment afterwards.) The method starts from an internal squeeze
 (`symbolic.contact.force_closure`) of the size that the load needs.
 """
 
@@ -36,40 +36,43 @@ from symbolic.records import Contact, Workcell
 from symbolic.records.numbered import GraspNumbers, NumberedWorkcell
 
 SCALE_FLOOR = 1e-9
-"""Force scale [N] of a zero load."""
+"""Force scale of a zero load [N]."""
 
 START_FLOOR = 1e-3
-"""Initial squeeze over the scale for a zero load."""
+"""Initial squeeze for a zero load, over the scale."""
 
 START_SHARE = 0.97
-"""Share of the way from the squeeze to the cones' boundary that a load may move the start."""
+"""Share of the way from the squeeze to the cones' boundary by which a load may move the start."""
 
 BEYOND = 1e12
-"""Normal force over the load's scale that marks a grasp that friction does not close."""
+"""Normal force, over the load's scale, that marks a grasp that friction does not close."""
 
 REST_WEIGHT = 0.02
-"""Weight, over the effort per degree, of the central path's known point at rest."""
+"""Weight of the barriers at the stored point of the central path at rest, over the effort per
+degree."""
 
 REST_SHARE = 0.95
-"""Share of the way from there to the cones' boundary that the first-order prediction may go."""
+"""Share of the way from this point to the cones' boundary that the first-order prediction may
+go."""
 
 ALIKE = 0.1
-"""Squeeze, over the scale, up to which a load counts as similar to that at rest."""
+"""A load counts as similar to the load at rest if it needs less additional squeeze than this, over
+the scale."""
 
 SCALING_INPUTS = ("friction", "reach")
-"""Inputs after the load that scale states; others may follow."""
+"""Names of the inputs after the load that scale states. Others may follow them."""
 
 WHOLE = ca.SX.ones(2)
 """Relative sizes of unchanged patches."""
 
 
 class Grasp:
-    """The pads of one workcell as a convex program. Compared by identity.
+    """The pads of one workcell as a convex program. Programs are compared by identity.
 
     Attributes:
-        robots: index of each pad's robot.
-        patches, cell_sizes, given: see `symbolic.contact.central_path.ConvexProgram`.
-        friction: (2,) coefficients of the robots' pads.
+        robots: index of the robot of each pad.
+        patches, cell_sizes, given: patches, inputs and symbolic parameters of the `ConvexProgram`.
+        friction: (2,) friction coefficients of the robots' pads.
         numbers: derived constants of the grasp.
     """
 
@@ -103,11 +106,12 @@ class Grasp:
         return len(self._free)
 
     def free(self, wrenches: list[ca.SX]) -> ca.SX:
-        """See `symbolic.contact.central_path.ConvexProgram`."""
+        """Select the free components of all wrenches."""
         return ca.vertcat(*wrenches)[self._free.tolist()]
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
-        """See `symbolic.contact.central_path.ConvexProgram`."""
+        """Compute all wrenches that balance the load among the inputs, from their free
+        components."""
         load, *sizes = cell
         return self._balanced_wrenches(load, free, sizes)
 
@@ -130,9 +134,12 @@ class Grasp:
         return 0.5 * total
 
     def start(self, cell: list[ca.SX]) -> tuple[list[ca.SX], ca.SX]:
-        """Return a start: for loads similar to that at rest, the first-order prediction of the
-        central path from its point at rest; else the least states that balance the load. The
-        squeeze is added until the states lie within the cones."""
+        """Return states within the cones that balance the load, and their weight.
+
+        For a load similar to the load at rest, the states are the first-order prediction of the
+        central path from its point at rest. Otherwise they are the least-norm states. In both cases
+        squeeze is added until they lie within the cones.
+        """
         load, *sizes = cell[: 1 + len(SCALING_INPUTS)]
         given, rest = self.squeeze_states(*sizes), ca.SX(number(self.numbers.load_at_rest))
         states, slopes = self._at_rest
@@ -154,7 +161,7 @@ class Grasp:
         return [c + press * s for c, s in zip(chosen, given, strict=True)], share
 
     def _squeeze_scale(self, given: list[ca.SX], asked: list[ca.SX]) -> ca.SX:
-        """Compute the multiple of the squeeze that moves states into the cones."""
+        """Compute how much of the squeeze moves states into the cones."""
         shares = [p.lowest(s, a) for p, s, a in zip(self.patches, given, asked, strict=True)]
         return ca.fmax(-minimum(shares), 0.0) / START_SHARE + START_FLOOR
 
@@ -166,7 +173,8 @@ class Grasp:
         return ca.SX(number(numbers.rest)), ca.SX(number(numbers.rest_slopes))
 
     def complete(self) -> GraspNumbers:
-        """Return the constants with the states at rest, of a grasp without symbols."""
+        """Return the constants together with the states at rest, for a grasp without symbolic
+        parameters."""
         inputs = [self.numbers.load_at_rest, *map(np.array, self._nominal())]
         load, *sizes = [ca.SX(ca.DM(value)) for value in inputs][: 1 + len(SCALING_INPUTS)]
         asked, given = self.least_states(load, *sizes), self.squeeze_states(*sizes)
@@ -175,24 +183,27 @@ class Grasp:
         return replace(self.numbers, rest=rest, rest_slopes=slopes)
 
     def _nominal(self) -> tuple[list[float], ...]:
-        """Return the cell's own values of the inputs after the load."""
+        """Return the cell's own values of the inputs that follow the load."""
         return (np.array(ca.evalf(self.friction)).ravel().tolist(),)
 
     def least_states(self, load: ca.SX, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
-        """Compute the least-norm states that balance a load (6,), inside the cones or not."""
+        """Compute the least-norm states that balance a load (6,). They may lie outside the
+        cones."""
         return self._at(ca.mtimes(number(self.numbers.spread), load), friction, reach)
 
     def squeeze_states(self, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
-        """Return the initial squeeze as states, at friction coefficients (2,) of the robots. It may
-        lie outside the cones if these are far below the nominal ones.
+        """Return the initial squeeze as states for other friction coefficients. It may lie outside
+        the cones if these are far below the nominal ones.
 
         Args:
-            reach: (2,) sizes of the robots' patches over their own.
+            friction: (2,) friction coefficients of the robots' pads.
+            reach: (2,) sizes of the robots' patches over the cell's own sizes.
         """
         return self._at(ca.SX(number(self.numbers.squeeze)), friction, reach)
 
     def squeeze_normals(self) -> Array:
-        """Compute `normals` of a grasp without symbols."""
+        """Compute the normal force (2,) of each robot in the squeeze, for a grasp without symbolic
+        parameters."""
         return np.array(ca.evalf(self.normals)).ravel()
 
     @property
@@ -204,8 +215,8 @@ class Grasp:
         return found
 
     def squeeze_wrenches(self) -> Array:
-        """Compute the wrenches (k, 6) of all pads in the squeeze, without symbols; see
-        `grasp_wrenches`."""
+        """Compute the wrenches (k, 6) of all pads in the squeeze, along the pads' axes, for a grasp
+        without symbolic parameters."""
         states = ca.vertsplit(ca.SX(number(self.numbers.squeeze)), self._ends)
         parts = [
             full_wrench(self.units(i, self.friction) * state) for i, state in enumerate(states)
@@ -215,11 +226,13 @@ class Grasp:
     def solve(
         self, cell: list[ca.MX], given: Sequence[ca.MX], differentiable: bool = False
     ) -> ca.MX:
-        """Solve for the least effort and return its `result` [N, N m], beyond any limit if friction
-        does not close the grasp.
+        """Build the expression of all pads' wrenches of least effort [N, N m]. They exceed any
+        limit if friction does not close the grasp.
 
         Args:
-            cell: the inputs, the load in newtons first.
+            cell: the program's inputs, first the load in newtons.
+            given: symbolic parameters of the grasp.
+            differentiable: True for exact first derivatives.
         """
         load, *others = cell
         size = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
@@ -239,8 +252,8 @@ class Grasp:
     def result(
         self, wrenches: list[ca.SX], sizes: list[ca.SX]
     ) -> tuple[ca.SX, ca.SX | ca.DM | float]:
-        """Return all pads' wrenches over the load's scale, see `grasp_wrenches`, and the value
-        beyond any limit that replaces them without a solution.
+        """Return all pads' wrenches over the load's scale, and the value that replaces them if
+        there is no solution.
 
         Args:
             wrenches: scaled wrenches.
@@ -251,7 +264,8 @@ class Grasp:
         return ca.vertcat(*whole), ca.repmat(beyond, len(wrenches), 1)
 
     def units(self, i: int, friction: ca.SX, reach: ca.SX = WHOLE) -> ca.SX:
-        """Return the units (m,) of the entries of pad i's scaled wrench."""
+        """Return the units (m,) of the entries of pad i's scaled wrench: factors to newtons and
+        newton metres."""
         robot = self.robots[i]
         radius = self.numbers.reach * self._pads[i].patch_radius
         mu = friction[robot]
@@ -259,7 +273,7 @@ class Grasp:
 
     def _at(self, states: ca.SX, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
         """Convert states (n,) at the nominal friction and sizes to states of the same forces at
-        others."""
+        other friction and sizes."""
         moved, owns = [], ca.vertsplit(states, self._ends)
         for pad, robot, state in zip(self._pads, self.robots, owns, strict=True):
             by_friction, by_reach = pad.friction / friction[robot], 1.0 / reach[robot]
@@ -274,12 +288,13 @@ def grasp_wrenches(
     friction: ca.MX,
     given: Sequence[ca.MX] = (),
 ) -> ca.MX:
-    """Build the wrenches of least effort, (6,) per pad side by side, in its pad's axes: N, T (2,)
-    [N], the first moment N d (2,) and M [N m]. Normal forces exceed any limit if friction does not
-    close the grasp.
+    """Build the expression of the wrenches of least effort, (6,) per pad one after the other, along
+    the pad's axes: N, T (2,) [N], the first moment N d (2,) and M [N m]. Normal forces exceed any
+    limit if friction does not close the grasp.
 
     Args:
-        load: (6,) force and moment about the box frame's origin, along the box's axes.
+        grasp: the pads.
+        load: (6,) force and moment about the box frame's origin, along the box's axes [N, N m].
         friction: (2,) Coulomb coefficients of the robots' pads.
         given: symbolic parameters of the grasp.
     """
@@ -287,7 +302,7 @@ def grasp_wrenches(
 
 
 def full_wrench(wrench: ca.SX) -> ca.SX:
-    """Return all six entries of a pad's wrench (4,)."""
+    """Return all six entries of the wrench of a pad, from the four that it bears."""
     whole = ca.SX(WRENCH_SIZE, wrench.shape[1])
     whole[list(EVEN), :] = wrench
     return ca.densify(whole)

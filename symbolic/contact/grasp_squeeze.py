@@ -1,7 +1,7 @@
-"""Least squeeze of pads with any normals: the commanded force of one robot that holds a load.
+"""Least squeeze of pads with any normals: the least commanded force of one robot that holds a load.
 
-The program is that of `symbolic.contact.grasp` with a linear objective, so that the commanded force
-is a convex function of the load.
+The program has the constraints of `symbolic.contact.grasp` and a linear objective, so the commanded
+force is a convex function of the load.
 """
 
 from __future__ import annotations
@@ -16,14 +16,15 @@ from symbolic.records import Workcell
 from symbolic.records.numbered import NumberedWorkcell
 
 DISPLACED = 6
-"""Fixed-point iterations for the moments of displaced forces: each multiplies the error by the
-displacement over the pads' distance."""
+"""Number of fixed-point iterations for the moments of displaced forces. Each multiplies the error
+by the displacement over the pads' distance."""
 
 REACHES = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95)
-"""Relative sizes of the patches at which an initial squeeze is sought."""
+"""Relative sizes of the patches within which an initial squeeze is sought, in the order of
+trial."""
 
 ROUNDING = 1e-6
-"""Share of the commanded force by which displaced forces may exceed it."""
+"""Share of the commanded force by which displaced forces may exceed their limits."""
 
 OTHER_WEIGHT = 1e-3
 """Weight of the other robot's normal force, which makes the solution unique. It raises the
@@ -31,10 +32,12 @@ commanded force slightly above the least."""
 
 
 class GraspSqueeze(Grasp):
-    """Program of the least normal force of one robot, plus `OTHER_WEIGHT` times the other's.
+    """Program that minimises the normal force of one robot plus `OTHER_WEIGHT` times that of the
+    other.
 
-    Inputs: load; friction coefficients and sizes of the patches over the cell's own, (2,) by robot;
-    displacements (4,) along the pads' tangents, the same for all pads of a robot.
+    Inputs: load (6,); friction (2,) of each robot's pads; sizes (2,) of each robot's patches over
+    the cell's own; displacements (4,) along the pads' tangents, two numbers for all pads of a robot
+    [m].
 
     Attributes:
         workcell: the cell.
@@ -57,11 +60,12 @@ class GraspSqueeze(Grasp):
         self.cell_sizes = (*self.cell_sizes, ("reach", 2), ("displacement", 4))
 
     def _nominal(self) -> tuple[list[float], ...]:
-        """See `Grasp`."""
+        """Return the cell's own values of the inputs that follow the load."""
         return (*super()._nominal(), [1.0, 1.0], [0.0] * 4)
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
-        """See `symbolic.contact.central_path.ConvexProgram`."""
+        """Compute all wrenches that balance the load of displaced pads, from their free
+        components."""
         load, friction, reach, displacement = cell
         wrenches = self._balanced_wrenches(load, free, [friction, reach])
         for _ in range(DISPLACED):
@@ -72,7 +76,7 @@ class GraspSqueeze(Grasp):
         return wrenches
 
     def _turned(self, wrenches: list[ca.SX], displacement: ca.SX, sizes: list[ca.SX]) -> ca.SX:
-        """Compute the moment (3,) that displaced scaled wrenches add."""
+        """Compute the additional moment (3,) of scaled wrenches at displaced pads."""
         total = ca.SX.zeros(3)
         for i, (pad, robot, own) in enumerate(zip(self._pads, self.robots, wrenches, strict=True)):
             normal, *tangent = ca.vertsplit((self.units(i, *sizes) * own)[:3])
@@ -82,14 +86,16 @@ class GraspSqueeze(Grasp):
         return total
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
-        """See `symbolic.contact.central_path.ConvexProgram`."""
+        """Compute the normal force of the commanded robot plus `OTHER_WEIGHT` times that of the
+        other."""
         total = 0.0
         for wrench, robot in zip(wrenches, self.robots, strict=True):
             total += wrench[0] * (1.0 if robot == self.commanded else OTHER_WEIGHT)
         return total
 
     def result(self, wrenches: list[ca.SX], sizes: list[ca.SX]) -> tuple[ca.SX, ca.SX | float]:
-        """See `Grasp`."""
+        """Return the normal forces (2,) of the robots over the load's scale, and the value that
+        replaces them if there is no solution."""
         force = [ca.SX(0.0), ca.SX(0.0)]
         for own, robot in zip(wrenches, self.robots, strict=True):
             force[robot] += own[0]
@@ -106,17 +112,17 @@ def commanded_forces(
     handed: dict[str, ca.MX] | None = None,
     differentiable: bool = False,
 ) -> ca.MX:
-    """Build the normal forces (2,) of the robots [N]: the commanded one, a convex function of the
-    load, and the resulting one of the other robot. Both exceed any limit if the grasp does not
-    close.
+    """Build the expression of the robots' normal forces (2,) [N]: the commanded force, which is
+    convex in the load, and the resulting force of the other robot. Both exceed any limit if
+    friction does not close the grasp.
 
     Args:
         load: (6,) force and moment about the box frame's origin, along the box's axes.
         friction: (2,) Coulomb coefficients of the robots' pads.
-        share: (2,) sizes of the robots' patches over the cell's own.
-        displacement: (4,) of the pads [m].
+        share: (2,) sizes of the robots' patches over the cell's own sizes.
+        displacement: (4,) displacements of the pads along their tangents [m].
         handed: symbolic parameters of the squeeze.
-        differentiable: make first derivatives exact.
+        differentiable: True for exact first derivatives.
     """
     handed = handed or {}
     reach = share / as_mx(ca.SX(number(squeeze.numbers.reach)), squeeze.given, handed)
@@ -132,9 +138,16 @@ def commanded_slack(
     displacement: ca.SX,
     force: ca.SX,
 ) -> ca.SX:
-    """Build the slack of a commanded force, a sufficient test. It is positive if the least-norm
-    states plus the squeeze that needs this force lie within all cones. Arguments as of
-    `commanded_forces`."""
+    """Build the slack of a commanded force, a sufficient test that the force holds a load.
+
+    The slack is positive if the least-norm states, plus the squeeze that needs this force, lie
+    within all cones.
+
+    Args:
+        squeeze: the program.
+        load, friction, share, displacement: as in `commanded_forces`.
+        force: commanded force [N].
+    """
     reach = share / squeeze.numbers.reach
     asked, given = (
         squeeze.least_states(load, friction, reach),
@@ -150,9 +163,12 @@ def commanded_slack(
 
 
 def internal_force_gain(squeeze: GraspSqueeze) -> ca.Function:
-    """Build the function from friction and sizes of the patches, (2,) by robot, to the additional
-    commanded force [N] per newton of tangential force between the arms at any pad, borne by the
-    friction that the squeeze leaves."""
+    """Build the function of the additional commanded force [N] per newton with which the arms push
+    tangentially against each other at any pad.
+
+    The push is borne by the friction that the squeeze leaves. Inputs: friction (2,) and sizes of
+    the patches (2,) by robot.
+    """
     friction, share = ca.SX.sym("friction", 2), ca.SX.sym("share", 2)
     given = squeeze.squeeze_states(friction, share / squeeze.numbers.reach)
     left = [

@@ -1,23 +1,23 @@
-"""Hands that hold by themselves: cups, magnets and grippers, each with its own holding force.
+"""Hands that hold without a squeeze: cups, magnets and grippers, each with its own holding force.
 
 A hand pulls the payload against itself with the holding force G. It bears a share of the load
 (`symbolic.contact.elastic.layer_shares`): the normal force N, positive if it presses, the
-tangential force T, moments M_x and M_y about the tangents and the torsion tau. Its patch presses
-with G + N. Required is
+tangential force T, moments M_x and M_y about the tangents, and the torsion tau. Its patch presses
+with G + N. The hand holds if
 
     G >= |M| / kern - N                                             so that no rim lifts off,    (1)
     G >= sqrt(|T|^2 + t^2 + kappa |T| t) / mu - N,  t = |tau| / c,  so that nothing slides.      (2)
 
-The kern is the shift of the centre of pressure at which the pressure at a rim vanishes; of a
-rectangle both axes add up. c is the mean distance of the patch's points from its centre. kappa
-makes (2) safe against the limit curve of a patch under even pressure (Howe and Cutkosky, IJRR
-1996): a disc requires 0 to 2.1 % more than exact, the ring of a cup's lip 0 to 3.0 %, a rectangle 0
-to 11 % up to sides of 2 to 1, and up to 21 % at 5 to 1. Both right sides are convex in the load and
-of degree one: a multiple of the load requires that multiple of the force, and a sum at most the
-sum.
+The kern is the shift of the centre of pressure at which the pressure at a rim vanishes; for a
+rectangle the ratios of both axes add up. c is the mean distance of the patch's points from its
+centre. kappa makes (2) safe against the limit curve of a patch under even pressure (Howe and
+Cutkosky, IJRR 1996): a disc requires 0 to 2.1 % more than exact, the ring of a cup's lip 0 to 3.0
+%, a rectangle 0 to 11 % up to sides of 2 to 1, and up to 21 % at 5 to 1. Both right sides are
+convex in the load and of degree one: a multiple of a load requires the same multiple of the force,
+and a sum of loads at most the sum of the forces.
 
-Each hand has to hold its own share, although others could take over a part of it: a cup that slides
-or lifts leaks.
+Each hand has to hold its own share, although others could take over a part: a cup that slides or
+lifts leaks.
 """
 
 from __future__ import annotations
@@ -41,17 +41,19 @@ from symbolic.records.numbered import NumberedContact
 from symbolic.records.quantities import GRAVITY
 
 KAPPA_DISC, KAPPA_RING = 0.3, 0.5
-"""Coefficients of (2): the least of one digit that never ask for less than the limit curve does."""
+"""Coefficients kappa of a disc and of a ring in (2): the smallest with one digit that never require
+less than the limit curve."""
 
 KAPPA_RECTANGLE = (0.75, 0.7)
-"""Likewise a and b of the coefficient 1 - 1 / (a + b q) of a rectangle whose sides are as q to 1:
-0.31 of a square, 1 of a line."""
+"""Numbers a and b in kappa = 1 - 1 / (a + b q) of a rectangle whose sides are as q to 1: 0.31 for a
+square, 1 for a line."""
 
 LEAST_MEAN_NORMAL = 0.1
-"""Length of an arm's mean normal below which its hands are fingers around an edge."""
+"""If the mean of the normals of an arm's hands is shorter than this, the hands are fingers around
+an edge."""
 
 FLOOR = 1e-9
-"""Added in squares to forces [N] and moments [N m], so that lengths have slopes at zero."""
+"""Added in squares to forces [N] and moments [N m], so that lengths have derivatives at zero."""
 
 
 @dataclass(frozen=True)
@@ -59,10 +61,10 @@ class HandPatch:
     """Lengths of a hand's patch.
 
     Attributes:
-        kern: along the axes of the hand [m].
-        is_round: the patch is a disc or a ring.
-        twist: c of (2) [m].
-        kappa: of (2).
+        kern: shifts along both axes of the hand at which the pressure at a rim vanishes [m].
+        is_round: True for a disc or a ring.
+        twist: length c in (2) [m].
+        kappa: coefficient kappa in (2).
     """
 
     kern: tuple[Expression, Expression]
@@ -72,7 +74,7 @@ class HandPatch:
 
     @classmethod
     def of(cls, hand: Contact) -> HandPatch:
-        """Return the patch of a hand, whose lengths may be symbols."""
+        """Return the patch of a hand. Its lengths are symbols if those of the hand are."""
         is_round = hand.half_sides is None
         twist = hand.patch_radius if hand.is_ring else SoftPatch.of(hand, np.eye(3)).twist
         kappa: Expression = KAPPA_RING if hand.is_ring else KAPPA_DISC
@@ -86,13 +88,14 @@ class HandPatch:
 def required_holding_forces(
     wrench: Expression, friction: Expression, patch: HandPatch
 ) -> tuple[Expression, Expression]:
-    """Compute the holding forces that (1) and (2) require of a hand [N]; negative if the load
-    presses it on strongly enough.
+    """Compute the holding forces of a hand that (1) and (2) require [N]. They are negative if the
+    load presses the hand on strongly enough.
 
     Args:
-        wrench: (6,) of the hand on the payload, T, N, M_x, M_y, tau in its axes [N, N m].
-        friction: Coulomb coefficient.
-        patch: of the hand.
+        wrench: (6,) wrench of the hand on the payload, along the hand's axes: T, N, M_x, M_y, tau
+            [N, N m].
+        friction: Coulomb coefficient of the hand.
+        patch: patch of the hand.
     """
     normal = wrench[2]
     # A moment about x shifts the pressure along y.
@@ -108,11 +111,16 @@ def _length(*components: Expression) -> Expression:
 
 
 def internal_force_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Array:
-    """Compute the additional holding force (n, 3) of each hand per newton between the arms, for the
-    worst direction: a and b of a / mu + b against sliding, and the force against lifting [1].
+    """Compute the additional holding force of each hand per newton with which the arms push against
+    each other, for the worst direction.
 
-    Arms with an error of their relative pose work against each other; both arms' layers are springs
-    in series. Bounds over all directions are summed, so that the result is an upper bound.
+    An error of the arms' relative pose makes the arms push against each other; the layers of both
+    arms are springs in series. Bounds over all directions are summed, so the result is an upper
+    bound.
+
+    Returns:
+        (n, 3) for each hand a and b, which give a / mu + b against sliding, and the force against
+        lifting [1].
     """
     maps, stiff = [wrench_to_box(pad) for pad in pads], [layer_stiffness(pad) for pad in pads]
     wholes = [np.zeros((6, 6)), np.zeros((6, 6))]
@@ -133,9 +141,12 @@ def internal_force_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Arra
 
 
 class HoldingHands(ContactModel):
-    """Hands of both arms, any number with any normals. The normal force of an arm stands for the
-    largest holding force that any of its hands needs. In worst cases the hands of both arms count
-    together: no force is commanded, and one limit applies to both."""
+    """Contact model of hands of both arms, any number and with any normals.
+
+    The normal force of an arm stands for the largest holding force that any of its hands needs. In
+    worst cases the hands of both arms count together: no force is commanded, and one limit applies
+    to both arms.
+    """
 
     assumption = "hands that hold by themselves, on arms that keep their poses"
     is_squeeze = False
@@ -146,7 +157,7 @@ class HoldingHands(ContactModel):
 
     @property
     def problem(self) -> Problem | None:
-        """See `ContactModel`."""
+        """Key and message if a contact is a pad or the arms' holding forces differ, else None."""
         pads = [f"contacts[{i}]" for i, c in enumerate(self.workcell.contacts) if c.kind == "pad"]
         if pads:
             return (
@@ -165,7 +176,7 @@ class HoldingHands(ContactModel):
 
     @property
     def level_force(self) -> float:
-        """Holding force that a hand needs with the payload level and still [N]."""
+        """Holding force that a hand needs with the payload level and at rest [N]."""
         payload, contacts = self.workcell.payload, self.workcell.contacts
         centre = payload.centre_of_mass
         load = ContactLoad(
@@ -183,8 +194,11 @@ class HoldingHands(ContactModel):
         implicit: ImplicitVariables | None = None,
         displaced: bool = False,
     ) -> HeldLoad:
-        """See `ContactModel`. The tangential force is the part of the load that the holding force
-        bears by friction, so that it never exceeds friction times the normal force."""
+        """Return the holding forces that a load requires, with each hand's share of the load.
+
+        The tangential force is the part of the load that the holding force bears by friction, so it
+        never exceeds friction times the normal force.
+        """
         workcell = self.workcell
         places = [number(contact.T_box_pad[:3, 3]) for contact in workcell.contacts]
         # The axes of the box, along those of the load.
@@ -220,30 +234,33 @@ class HoldingHands(ContactModel):
         )
 
     def friction_lost(self, apart: Array) -> Array:
-        """See `ContactModel`. There is no squeeze that displacements could turn into a moment."""
+        """Return zero: without a squeeze, displacements (k,) of the hands cost no friction."""
         return 0.0 * apart
 
     def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
-        """See `ContactModel`. Displaced hands shift the centre of mass relative to them."""
+        """Return half-widths (3,) of the range of the centre of mass [m], enlarged by the hands'
+        displacements, and no displacements (1, 4): displaced hands shift the centre of mass
+        relative to them."""
         off = uncertainty.pad_position + uncertainty.apart / 2.0
         return uncertainty.centre_of_mass + off, np.zeros((1, 4))
 
     def leading_excess(self, load: ContactLoad, opposed: Expression) -> Expression:
-        """See `ContactModel`. The hands of both arms count together."""
+        """Return zero, because the hands of both arms count together."""
         return ca.SX(0.0)
 
     def commanded_forces(
         self, normal: Expression, friction: Expression, tracking: Expression, opposed: Expression
     ) -> Expression:
-        """See `ContactModel`. A share of the holding force, for example of a vacuum, may be
-        missing."""
+        """Return the holding force (2,) that both arms need [N], equal for both. Part of the
+        holding force, for example of a vacuum, may be missing."""
         needed = ca.fmax(normal[0], normal[1]) + opposed * self._opposed_need(friction)
         needed /= 1.0 - ca.fmax(tracking[0], tracking[1])
         return ca.vertcat(needed, needed)
 
     def approach(self, arm: int) -> Array:
-        """See `ContactModel`. The hands of an arm come along their normals; fingers, whose normals
-        balance, across them from outside."""
+        """Return the direction (3,) in which an arm's hands approach the payload, box frame. Hands
+        approach along their mean normal; fingers, whose normals cancel, across their normals from
+        outside."""
         of_arm = zip(self.workcell.pads, self.workcell.pad_robots, strict=True)
         T = np.array([pad.T_box_pad for pad, robot in of_arm if robot == arm])
         normals, middle = T[:, :3, 2], T[:, :3, 3].mean(axis=0)
@@ -253,18 +270,20 @@ class HoldingHands(ContactModel):
         return np.asarray(way / np.linalg.norm(way))
 
     def held_with(self, commanded: Array) -> Array:
-        """See `ContactModel`. Hands hold with all of their force."""
+        """Return the holding forces (n, 2) [N]. They do not depend on commanded forces."""
         own = [contact.holding_force for contact in self.workcell.contacts]
         return np.broadcast_to(own, commanded.shape)
 
     def pulled_apart(self, along: Array, across: Array, stiffness: float) -> tuple[Array, Array]:
-        """See `ContactModel`. Each direction counts like the worst."""
+        """Return zero changes (n,) of the normal forces, and rises (n,) of the least forces, if the
+        arms are displaced against each other [N]. Each direction counts as the worst."""
         friction = ca.DM([contact.friction for contact in self.workcell.contacts])
         most = float(ca.evalf(self._opposed_need(friction)))
         return 0.0 * along, stiffness / 2.0 * np.hypot(along, across) * most
 
     def _opposed_need(self, friction: Expression) -> Expression:
-        """Return the most that one newton between the arms asks of a hand."""
+        """Return the largest additional holding force that one newton between the arms requires of
+        a hand."""
         most = ca.SX(0.0)
         for (a, b, lifting), i in zip(self._opposed, self.workcell.pad_robots, strict=True):
             most = ca.fmax(most, ca.fmax(a / friction[i] + b, lifting))
@@ -272,7 +291,8 @@ class HoldingHands(ContactModel):
 
     @property
     def _opposed(self) -> list[list[Any]]:
-        """Per hand its row of `internal_force_needs`; symbols if the cell's numbers are."""
+        """For each hand its row of `internal_force_needs`; symbols if the cell's numbers are
+        symbols."""
         pads = self.workcell.pads
         if isinstance(pads[0], NumberedContact):
             return [ca.vertsplit(p.opposed) for p in pads if isinstance(p, NumberedContact)]
@@ -280,7 +300,7 @@ class HoldingHands(ContactModel):
 
     @property
     def _shares(self) -> list[Any]:
-        """Per hand its matrix of `layer_shares`; symbols if the cell's numbers are."""
+        """For each hand its matrix of `layer_shares`; symbols if the cell's numbers are symbols."""
         pads = self.workcell.pads
         if isinstance(pads[0], NumberedContact):
             return [pad.share for pad in pads if isinstance(pad, NumberedContact)]

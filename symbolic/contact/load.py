@@ -1,7 +1,7 @@
 """The contact forces at one sample of the box motion, as one CasADi function.
 
-Joins rotation, contact forces and centres of pressure (paper Section 4.4). The contact model gives
-the forces as an expression, or the program of `symbolic.contact.grasp` finds them.
+It joins rotation, contact forces and centres of pressure (paper Section 4.4). The contact model
+gives the forces as an expression, or the program of `symbolic.contact.grasp` computes them.
 """
 
 from __future__ import annotations
@@ -42,12 +42,11 @@ LOAD_OUTPUTS = (
 
 angular_velocity, angular_acceleration (3,): world frame [rad/s, rad/s^2]. normal_force,
 tangential_force (2,) [N]. contact_force (6,): forces of robots 1 and 2 on the box, world [N].
-pressure_shift (2,): lengths of the shifts [m]; shift_vector (6,): both shifts, world [m]. Of a
-robot with several pads: the sums of their normal forces and of the lengths of their tangential
-ones, the longest shift, and the first pad's shift.
-required_moment, point_moment_residual, moment_residual (3,): about the centre of mass, world
-[N m]. wrench_1, wrench_2 (6,): force and moment that each robot exerts on the box, about the
-nominal contact point, world axes [N, N m].
+pressure_shift (2,): lengths of the shifts [m]; shift_vector (6,): both shifts, world [m]. For a
+robot with several pads: the sums of the pads' normal forces and of the lengths of their tangential
+forces, the longest shift, and the first pad's shift vector. required_moment, point_moment_residual,
+moment_residual (3,): about the centre of mass, world [N m]. wrench_1, wrench_2 (6,): force and
+moment that each robot exerts on the box, about the nominal contact point, world axes [N, N m].
 """
 
 SIZES = {"pose": 6, "rate": 6, "second_rate": 6, "friction": 2, "centre_of_mass": 3}
@@ -60,14 +59,15 @@ SAMPLE_SIZES = (
     ("friction", 2),
     ("centre_of_mass", 3),
 )
-"""Inputs of functions of one sample's forces; force and moment in the world frame."""
+"""Inputs of functions of one sample's forces, and their sizes; force and moment in the world
+frame."""
 
 
 def load_function(workcell: Workcell) -> ca.Function:
     """Build the function of contact forces and centres of pressure at one sample of the box motion.
 
-    Inputs: pose, rate, second_rate (6,) as in `symbolic.path.time_law.TimedPath`. Outputs: see
-    `LOAD_OUTPUTS`.
+    Inputs: pose, rate, second_rate (6,), the box pose and its first and second time derivative.
+    Outputs: `LOAD_OUTPUTS`.
     """
     payload = workcell.payload
     own: list[Expression] = [frictions(workcell), ca.SX(number(payload.centre_of_mass))]
@@ -90,22 +90,24 @@ def frictions(workcell: Workcell) -> ca.SX:
 def resultant_force(
     mass: float, offset: ca.SX, omega: ca.SX, alpha: ca.SX, acceleration: ca.SX
 ) -> ca.SX:
-    """Compute the resultant force (3,) on a turning and accelerating box, world frame (Eq. 34) [N].
+    """Compute the resultant force (3,) [N] on a rotating and accelerating box, world frame (Eq.
+    34).
 
     Args:
-        offset: (3,) from the box centre to its centre of mass [m].
+        mass: mass of the payload [kg].
+        offset: (3,) from the box centre to the centre of mass, world axes [m].
         omega, alpha: (3,) angular velocity and acceleration [rad/s, rad/s^2].
-        acceleration: (3,) of the box centre [m/s^2].
+        acceleration: (3,) acceleration of the box centre [m/s^2].
     """
     turning = ca.cross(alpha, offset) + ca.cross(omega, ca.cross(omega, offset))
     return required_force(mass, acceleration + turning)
 
 
 def uncertain_load_function(workcell: Workcell) -> ca.Function:
-    """Build `load_function` with friction and centre of mass as further inputs.
+    """Build the function of `load_function` with friction and centre of mass as further inputs.
 
     Inputs: pose, rate, second_rate (6,); friction (2,) coefficients of the contacts; centre_of_mass
-    (3,) in the box frame [m]. Outputs: see `LOAD_OUTPUTS`.
+    (3,) in the box frame [m]. Outputs: `LOAD_OUTPUTS`.
     """
     if contact_model(workcell).has_closed_form:
         return _closed_load_function(workcell)
@@ -141,7 +143,8 @@ def _closed_load_function(workcell: Workcell) -> ca.Function:
 
 
 def _grasp_load_function(workcell: Workcell) -> ca.Function:
-    """Build the load function of pads with any normals, see `symbolic.contact.grasp`."""
+    """Build the load function of pads whose forces the program of `symbolic.contact.grasp`
+    computes."""
     inputs = {name: ca.MX.sym(name, size) for name, size in SIZES.items()}
     names = ("angular_velocity", "angular_acceleration", "force", "required_moment")
     given = [ca.SX.sym(name, size) for name, size in SIZES.items() if name != "friction"]
@@ -166,8 +169,12 @@ def _named(inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
 def required(
     workcell: Workcell, pose: ca.SX, rate: ca.SX, second: ca.SX, centre_of_mass: ca.SX | ca.DM
 ) -> list[ca.SX]:
-    """Compute the dynamics of the box: R_world_box (3, 3), angular velocity and acceleration,
-    required force, and required moment about the centre of mass, (3,) each, world axes."""
+    """Compute the dynamics of the box.
+
+    Returns:
+        R_world_box (3, 3); then (3,) each, world axes: angular velocity, angular acceleration,
+        required force, and required moment about the centre of mass.
+    """
     turned = workcell.task.orientation
     rotation = rotation_matrix(turned, pose[3:])
     omega = angular_velocity(turned, pose[3:], rate[3:])
@@ -179,7 +186,7 @@ def required(
 
 
 def _sample_function(workcell: Workcell) -> ca.Function:
-    """Build the function from `SAMPLE_SIZES` to `GRASP_OUTPUTS`."""
+    """Build the function from the inputs `SAMPLE_SIZES` to the outputs `GRASP_OUTPUTS`."""
     inputs, given = [ca.MX.sym(*entry) for entry in SAMPLE_SIZES], mx_parameters(workcell.payload)
     pose, force, moment, friction, centre_of_mass = inputs
     asked = (pose, force, moment, centre_of_mass)
@@ -190,7 +197,8 @@ def _sample_function(workcell: Workcell) -> ca.Function:
 
 
 def _length(vector: Expression) -> Expression:
-    """Compute a length with a finite derivative at zero; 1e-12 m is far below any patch."""
+    """Compute a length that has a finite derivative at zero. The error, 1e-12 m, is far below any
+    patch."""
     return ca.sqrt(ca.sumsqr(vector) + 1e-24)
 
 
@@ -208,17 +216,17 @@ GRASP_OUTPUTS = (
     "wrench_1",
     "wrench_2",
 )
-"""Entries of `LOAD_OUTPUTS` that follow from the program's wrenches."""
+"""Entries of `LOAD_OUTPUTS` that follow from the wrenches of the program."""
 
 LEAST_FORCE = 1e-9
-"""Normal force below which the centre of pressure counts as that of the patch [N]."""
+"""With a smaller normal force the centre of pressure counts as the patch's centre [N]."""
 
 _ASKED = (("pose", 6), ("force", 3), ("moment", 3), ("centre_of_mass", 3))
 
 
 def box_load_function(workcell: Workcell) -> ca.Function:
-    """Build the function from `_ASKED` (world axes) to force and moment (6,) about the box frame's
-    origin, along the box's axes."""
+    """Build the function that converts a load in world axes to force and moment (6,) about the box
+    frame's origin, along the box's axes."""
     pose, force, moment, centre_of_mass = inputs = [ca.SX.sym(*entry) for entry in _ASKED]
     to_box = rotation_matrix(workcell.task.orientation, pose[3:]).T
     in_box = ca.mtimes(to_box, force)
@@ -227,8 +235,8 @@ def box_load_function(workcell: Workcell) -> ca.Function:
 
 
 def grasp_world_function(workcell: Workcell) -> ca.Function:
-    """Build the function from the inputs of `box_load_function` and the pads' wrenches (6 k,), see
-    `symbolic.contact.grasp.grasp_wrenches`, to `GRASP_OUTPUTS`."""
+    """Build the function from the inputs of `box_load_function` and the wrenches (6 k,) of k pads,
+    along the pads' axes, to `GRASP_OUTPUTS`."""
     pose, _, moment, centre_of_mass = inputs = [ca.SX.sym(*entry) for entry in _ASKED]
     pads, robots = workcell.pads, workcell.pad_robots
     wrenches = ca.SX.sym("wrenches", WRENCH_SIZE * len(pads))

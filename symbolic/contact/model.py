@@ -32,10 +32,11 @@ Both = tuple[Expression, Expression]
 
 @dataclass(frozen=True)
 class ContactLoad:
-    """The load on two contacts; all vectors along the same axes, for example the world's.
+    """The load on two contacts. All vectors are along the same axes, for example the world's.
 
     Attributes:
-        force, moment: (3,) on the payload, about its centre of mass [N, N m].
+        force, moment: (3,) force and moment that the contacts have to exert on the payload, about
+            its centre of mass [N, N m].
         arms: (3,) each, from the centre of mass to the nominal contact points [m].
         axes: (3, 3) tangents and normal of contact 1 as columns.
         friction: (2,) Coulomb coefficients.
@@ -53,12 +54,12 @@ class HeldLoad:
     """The forces of two contacts that balance a load.
 
     Attributes:
-        normal, tangential: (2,) normal forces and magnitudes of the tangential ones [N].
-        forces: (3,) each, on the payload [N].
-        shifts: (3,) each, of the centres of pressure [m].
-        moments: (3,) each, on the payload about the nominal contact points [N m].
-        point_residual, residual: (3,) unbalanced moment with the forces at the nominal points, and
-            with `moments` as well [N m].
+        normal, tangential: (2,) normal forces and magnitudes of the tangential forces [N].
+        forces: (3,) each, contact forces on the payload [N].
+        shifts: (3,) each, shifts of the centres of pressure [m].
+        moments: (3,) each, contact moments on the payload about the nominal contact points [N m].
+        point_residual, residual: (3,) unbalanced moment with the forces at the nominal points
+            alone, and with `moments` added [N m].
     """
 
     normal: Expression
@@ -78,19 +79,20 @@ class HeldLoad:
 
 @dataclass
 class ImplicitVariables:
-    """Symbols for the results of Newton's method. Outputs depend on the symbols; `replaced` inserts
-    the values.
+    """Symbols that stand for results of Newton's method. Outputs are built from the symbols;
+    `replaced` inserts the values.
 
     Attributes:
-        steps: Newton steps between a symbol and the outputs. One step makes first derivatives exact
-            although the symbol counts as constant; two make second derivatives exact as well.
+        steps: number of Newton steps between a symbol and the outputs. One step makes first
+            derivatives exact although the symbol counts as constant; two steps make second
+            derivatives exact too.
     """
 
     steps: int = 2
     _found: list[tuple[ca.SX, ca.SX]] = field(default_factory=list)
 
     def detach(self, value: ca.SX) -> ca.SX:
-        """Return a symbol for a value."""
+        """Return a new symbol that stands for a value."""
         symbol = ca.SX.sym("solved")
         self._found.append((symbol, value))
         return symbol
@@ -106,7 +108,7 @@ class ImplicitVariables:
         return ca.vertcat(ca.SX(0, 1), *[value for _, value in self._found])
 
     def replaced(self, outputs: list[Expression]) -> list[Expression]:
-        """Return outputs with the values inserted for the symbols."""
+        """Return the outputs with the values inserted for the symbols."""
         if not self._found:
             return outputs
         found: list[Expression] = ca.substitute(outputs, [self.symbols], [self.values])
@@ -114,22 +116,22 @@ class ImplicitVariables:
 
 
 class ContactModel(ABC):
-    """A model of one workcell's pads: two pads with opposite normals, unless a subclass says
-    otherwise.
+    """A contact model of one workcell. Methods assume two pads with opposite normals, unless a
+    subclass overrides them.
 
     Attributes:
-        workcell: the cell; its numbers may be symbols.
-        assumption: the pads that planned forces assume, for messages.
-        has_pressure_limit: the shift of the pressure within a patch is a limit of its own, because
-            forces do not grow with the moments.
-        has_elastic_layers: pads are elastic layers (`symbolic.contact.elastic`).
-        has_closed_form: `hold` gives the forces; else a program finds them.
-        is_squeeze: the arms press the payload between them: forces are commanded, and reference
-            forces limit the whole force of a robot as well.
-        holders: the pads or hands that commanded forces assume, for messages.
-        order: the command to them, as in 'press with 80 N'.
-        closing, opening: phases of a job in which standing arms take hold of the payload, and let
-            go of it.
+        workcell: the workcell; its numbers may be symbols.
+        assumption: description of the pads that planned forces assume, for messages.
+        has_pressure_limit: True if the shift of the pressure within a patch is a limit of its own,
+            because forces do not grow with the moments.
+        has_elastic_layers: True if pads are elastic layers (`symbolic.contact.elastic`).
+        has_closed_form: True if `hold` gives the forces, False if a program computes them.
+        is_squeeze: True if the arms press the payload between them. Forces are then commanded, and
+            reference forces also limit the whole force of a robot.
+        holders: description of the pads or hands that commanded forces assume, for messages.
+        order: words of the command, as in 'press with 80 N'.
+        closing, opening: names of the phases of a job in which arms at rest take hold of the
+            payload, and let go of it.
     """
 
     assumption: ClassVar[str]
@@ -147,8 +149,8 @@ class ContactModel(ABC):
 
     @property
     def has_scalar_squeeze(self) -> bool:
-        """True if the force of one pad determines that of the other, so that one number, the least
-        squeeze, describes a case."""
+        """True if the force of one pad determines that of the other. One number, the least squeeze,
+        then describes a case."""
         return self.has_closed_form
 
     @property
@@ -159,11 +161,12 @@ class ContactModel(ABC):
     @property
     @abstractmethod
     def problem(self) -> Problem | None:
-        """Key and message if the pads cannot hold the payload under every motion, else None."""
+        """Key of the workcell file and message if the pads cannot hold the payload under every
+        motion, else None."""
 
     @property
     def level_force(self) -> float:
-        """Normal force that holds the payload level and still between upright contacts [N]."""
+        """Normal force that holds the payload level and at rest between upright contacts [N]."""
         weight = -self.workcell.payload.mass * GRAVITY[2]
         return float(weight / sum(contact.friction for contact in self.workcell.contacts))
 
@@ -177,37 +180,37 @@ class ContactModel(ABC):
         """Return the least contact forces that balance a load.
 
         Args:
-            load: on both contacts.
-            implicit: collects results of Newton's method, for derivatives.
-            displaced: the pads may be laterally offset from each other by the arms of the load.
+            load: load on both contacts.
+            implicit: collector of results of Newton's method, for exact derivatives; None for none.
+            displaced: True if the arms of the load may offset the pads laterally from each other.
         """
 
     # --- smooth quantities for the polish ---
 
     @property
     def force_branches(self) -> Array:
-        """Coefficients (2, branches, 2) of the branches of each normal force by both
-        `force_quantities`; the largest branch is the force."""
+        """Coefficients (2, branches, 2) of the linear functions of both `force_quantities` whose
+        maximum is the normal force of each contact."""
         return np.eye(2)[:, None]
 
     def force_quantities(self, load: ContactLoad, held: HeldLoad) -> Expression:
-        """Return two smooth quantities (2,) of which the branches of the normal forces are linear
-        functions [N]."""
+        """Return two smooth quantities (2,) [N]. The branches of the normal forces are linear
+        functions of them."""
         return held.normal
 
     def planned_quantities(self, found: Mapping[str, Array]) -> Array:
-        """Return `force_quantities` (n, 2) of n samples from their `LOAD_OUTPUTS` [N]."""
+        """Return the `force_quantities` (n, 2) [N] of n samples from their `LOAD_OUTPUTS`."""
         return found["normal_force"]
 
     # --- worst cases ---
 
     def least_friction(self, uncertainty: Uncertainty) -> Array:
-        """Compute the coefficients of friction (2,) that cover the worst case of a set; zero or
-        less if none is left.
+        """Compute the friction coefficients (2,) that cover the worst case of an uncertainty; zero
+        or less if no friction is left.
 
         A pad tilted by t has the coefficient tan(atan mu - t). Pads displaced in opposite
-        directions by 2 e turn the squeeze into a moment, which is covered by a coefficient lower by
-        2 e / L, L being their distance.
+        directions by 2 e turn the squeeze into a moment. A coefficient lower by 2 e / L covers this
+        moment, L being the distance of the pads.
         """
         friction = np.array([contact.friction for contact in self.workcell.contacts])
         left = np.tan(np.arctan(friction * (1.0 - uncertainty.friction)) - uncertainty.turned)
@@ -215,15 +218,18 @@ class ContactModel(ABC):
         return np.asarray(left - self.friction_lost(apart))
 
     def friction_lost(self, apart: Array) -> Array:
-        """Return the reduction of the coefficients that covers relative displacements of the pads
-        [m]."""
+        """Return the reductions (k,) of the friction coefficient that cover relative displacements
+        (k,) of the pads [m]."""
         return apart / self.workcell.pad_distance
 
     def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
-        """Return half-widths (3,) of the range of the centre of mass, and displacements (k, 4) of
-        both pads along their tangents, that cover a set's displacements [m].
+        """Return the worst displacements of the pads under an uncertainty.
 
         A common displacement of both pads shifts the centre of mass relative to them.
+
+        Returns:
+            Half-widths (3,) of the range of the centre of mass [m], enlarged by common
+            displacements, and displacements (k, 4) of both pads along their tangents [m].
         """
         normal = self.workcell.contacts[0].T_box_pad[:3, 2]
         across = np.sqrt(np.maximum(1.0 - normal**2, 0.0))
@@ -233,14 +239,14 @@ class ContactModel(ABC):
     def commanded_forces(
         self, normal: Expression, friction: Expression, tracking: Expression, opposed: Expression
     ) -> Expression:
-        """Return the normal forces (2,) to command for least normal forces (2,) [N]. Both rise by
-        the same amount, because the motion fixes their difference.
+        """Return the commanded normal forces (2,) [N]. Both exceed the least forces by the same
+        amount, because the motion fixes their difference.
 
         Args:
             normal: (2,) least normal forces [N].
             friction: (2,) Coulomb coefficients.
-            tracking: (2,) missing share of each robot's force.
-            opposed: tangential force of the arms against each other [N].
+            tracking: (2,) share of each robot's force that may be missing.
+            opposed: tangential force with which the arms may push against each other [N].
         """
         share, held = tracking / (1.0 - tracking), opposed / ca.fmin(friction[0], friction[1])
         # Entry by entry: CasADi 3.8 loses the derivative of a product of vectors here.
@@ -249,47 +255,48 @@ class ContactModel(ABC):
 
     @property
     def leading_share(self) -> Array:
-        """Rise (2,) of each robot's force, as the leading one, per newton of the other's commanded
-        force."""
+        """Rise of the leading robot's force per newton of the other robot's commanded force, for
+        either robot leading (2,)."""
         return np.ones(2)
 
     def leading_excess(self, load: ContactLoad, opposed: Expression) -> Expression:
-        """Return the force of robot 1 beyond `leading_share` times the commanded force of robot 2
+        """Return the force of robot 1 minus `leading_share` times the commanded force of robot 2
         [N].
 
         Args:
-            load: on both contacts.
-            opposed: tangential force of the arms against each other [N].
+            load: load on both contacts.
+            opposed: tangential force with which the arms may push against each other [N].
         """
         return ca.dot(load.force, load.axes[:, 2])
 
     def internal_force_ratio(self, leader: int) -> Array:
-        """Return the rise (2,) of both robots' forces per newton that is commanded beyond the
-        plan."""
+        """Return the rise (2,) of both robots' forces per newton that the force-controlled robot
+        presses beyond its planned force."""
         return np.ones(2)
 
     def displacement_margin(self, uncertainty: Uncertainty) -> float:
-        """Return the remaining range of displacements in which forces can be computed [m]; zero or
-        less if the set's displacements exceed it."""
+        """Return the distance by which displacements may still grow until forces can no longer be
+        computed [m]; zero or less if the uncertainty exceeds the range."""
         return np.inf
 
     # --- jobs ---
 
     def approach(self, arm: int) -> Array:
-        """Return the direction (3,) in which an arm's pad comes to the payload, box frame."""
+        """Return the direction (3,) in which an arm's pad approaches the payload, box frame."""
         return self.workcell.contacts[arm].T_box_pad[:3, 2]
 
     def held_with(self, commanded: Array) -> Array:
-        """Return the normal forces (n, 2) that hold where these are commanded [N]."""
+        """Return the normal forces (n, 2) [N] that hold the payload if these forces are
+        commanded."""
         return commanded
 
     def pulled_apart(self, along: Array, across: Array, stiffness: float) -> tuple[Array, Array]:
-        """Return the changes (n,) of the normal forces and of the least ones where the arms, in
-        series, are displaced against one another [N].
+        """Return the changes (n,) [N] of the normal forces and of the least normal forces if the
+        arms, as springs in series, are displaced against each other.
 
         Args:
-            along, across: displacements (n,) of one pad, along the normal and across it [m].
-            stiffness: of each arm at its pad [N/m].
+            along, across: displacements (n,) of one pad along its normal and across it [m].
+            stiffness: stiffness of each arm at its pad [N/m].
         """
         friction = min(contact.friction for contact in self.workcell.contacts)
         return stiffness / 2.0 * along, stiffness / 2.0 * across / friction

@@ -11,9 +11,9 @@ share of contact 1. Its solution is the largest of five smooth functions (see
 
     N_1 + N_2 = max( F_t / mu,  |F_n|,  (mu F_t + mu^2 |F_n|) / (1 + mu^2) ).
 
-Centres of pressure: paper Eqs. 51-59. The forces are those of the program; each may act anywhere
-in the tangent plane of its contact, and the shifts are the least-norm ones that minimise the moment
-left over.
+Centres of pressure: paper Eqs. 51-59. Each force of the program may act anywhere in the tangent
+plane of its contact. Of the shifts that minimise the unbalanced moment, those of least norm are
+taken.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Both = tuple[Expression, Expression]
 """One value per contact."""
 
 TANGENT_FLOOR = 1e-9
-"""Added in squares below the root of the tangential force [N]: keeps derivatives finite."""
+"""Added in squares below the root of the tangential force [N], to keep derivatives finite."""
 
 
 def required_force(
@@ -55,7 +55,7 @@ def split_force(force: Expression, normal: Expression) -> tuple[Expression, Expr
 def normal_force_branches(
     f_n: Expression, f_t: Expression, friction: tuple[float, float]
 ) -> Expression:
-    """Compute five smooth functions (5,); the largest is the normal force N_2 of contact 2 [N].
+    """Compute five smooth functions (5,) whose maximum is the normal force N_2 of contact 2 [N].
 
     N_1 = N_2 + F_n. In order: both friction cones tight; contact 2 unloaded; contact 1
     unloaded; least effort with only the cone of contact 2 tight; with only that of contact 1.
@@ -118,9 +118,10 @@ def required_moment(
     m].
 
     Args:
-        inertia: (3, 3) about the centre of mass, box axes [kg m^2].
+        inertia: (3, 3) inertia about the centre of mass, box axes [kg m^2].
         rotation: R_world_box (3, 3).
-        velocity, acceleration: (3,) angular, world frame [rad/s, rad/s^2].
+        velocity, acceleration: (3,) angular velocity and acceleration, world frame [rad/s,
+            rad/s^2].
     """
     inertia_world = ca.mtimes([rotation, inertia, rotation.T])
     return ca.mtimes(inertia_world, acceleration) + ca.cross(
@@ -134,7 +135,8 @@ def pressure_shift(
     forces: tuple[Expression, Expression],
     tangents: tuple[Expression, Expression],
 ) -> tuple[Both, Expression, Expression]:
-    """Compute the least-norm shifts of both centres of pressure (Eqs. 54-59).
+    """Compute the least-norm shifts of both centres of pressure that minimise the unbalanced moment
+    (Eqs. 54-59).
 
     Args:
         moment: (3,) required moment about the centre of mass [N m].
@@ -143,8 +145,8 @@ def pressure_shift(
         tangents: two orthonormal vectors (3,) that span both contact planes, which are parallel.
 
     Returns:
-        Shifts (3,) in the tangent planes [m], and the unbalanced moments (3,) with the forces at
-        the nominal points and with the shifts applied, world frame [N m].
+        Shifts (3,) in the tangent planes [m]; unbalanced moment (3,) with the forces at the nominal
+        points, and with the shifts applied, world frame [N m].
     """
     point_residual = moment - ca.cross(arms[0], forces[0]) - ca.cross(arms[1], forces[1])
     plane = ca.horzcat(*tangents)

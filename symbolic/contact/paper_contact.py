@@ -17,8 +17,8 @@ from symbolic.expression import Expression
 class PaperContact(ContactModel):
     """Two round pads with opposite normals that choose their pressure.
 
-    Such pads need commanded moments at both wrists, which few cells have. So commanded forces hold
-    evenly pressing pads.
+    Such pads need commanded moments at both wrists, which few cells offer. So commanded forces are
+    computed for evenly pressing pads.
     """
 
     assumption = "pads that choose their pressure, by moments commanded at both wrists"
@@ -26,12 +26,12 @@ class PaperContact(ContactModel):
 
     @property
     def command_model(self) -> ContactModel:
-        """See `ContactModel`."""
+        """The model of evenly pressing pads, for commanded forces and worst cases."""
         return soft_finger(self.workcell)
 
     @property
     def problem(self) -> Problem | None:
-        """See `ContactModel`."""
+        """Key and message unless there are two round pads with opposite normals."""
         workcell = self.workcell
         if workcell.has_facing_pads:
             return None
@@ -50,7 +50,8 @@ class PaperContact(ContactModel):
         implicit: ImplicitVariables | None = None,
         displaced: bool = False,
     ) -> HeldLoad:
-        """See `ContactModel`: paper Eqs. 38-42 and 51-59."""
+        """Return the least forces (paper Eqs. 38-42) and the pressure shifts (Eqs. 51-59) that
+        balance a load."""
         axes, mu = load.axes, load.friction
         normal, tangential, forces = allocate(load.force, axes[:, 2], (mu[0], mu[1]))
         tangents = axes[:, 0], axes[:, 1]
@@ -60,7 +61,8 @@ class PaperContact(ContactModel):
 
     @property
     def force_branches(self) -> Array:
-        """See `ContactModel`: those of `normal_force_branches`, for contact 1 with F_n added."""
+        """Coefficients (2, 5, 2) of `normal_force_branches` by normal component and tangential
+        magnitude, for contact 1 with F_n added."""
         f_n, f_t = ca.SX.sym("f_n"), ca.SX.sym("f_t")
         contacts = self.workcell.contacts
         second = normal_force_branches(f_n, f_t, (contacts[0].friction, contacts[1].friction))
@@ -70,10 +72,12 @@ class PaperContact(ContactModel):
         )
 
     def force_quantities(self, load: ContactLoad, held: HeldLoad) -> Expression:
-        """Return the normal component and the tangential magnitude (2,) of the force [N]."""
+        """Return the normal component and the tangential magnitude (2,) of the required force
+        [N]."""
         return ca.vertcat(*split_force(load.force, load.axes[:, 2])[:2])
 
     def planned_quantities(self, found: Mapping[str, Array]) -> Array:
-        """See `ContactModel`. Both tangential forces have the same direction."""
+        """Return normal component and tangential magnitude (n, 2) of the required force [N] of n
+        samples. Both contacts' tangential forces have the same direction, so they add up."""
         normal, tangential = found["normal_force"], found["tangential_force"]
         return np.column_stack([normal[:, 0] - normal[:, 1], tangential.sum(axis=1)])

@@ -16,7 +16,7 @@ CONTACT_MODELS: dict[str, Callable[[Workcell], ContactModel]] = {
     "soft-finger": soft_finger,
     "holding-hands": HoldingHands,
 }
-"""Models by the name that `task.allocation` of a workcell file has."""
+"""Contact models by the name in `task.allocation` of a workcell file."""
 
 
 def contact_model(workcell: Workcell) -> ContactModel:
@@ -25,8 +25,8 @@ def contact_model(workcell: Workcell) -> ContactModel:
 
 
 def squeeze_problem(workcell: Workcell, purpose: str) -> str:
-    """Return why a purpose does not apply to hands that hold by themselves; '' for pads that
-    press."""
+    """Return a message why a purpose does not apply to hands that hold without a squeeze; '' for
+    pads that press."""
     if contact_model(workcell).is_squeeze:
         return ""
     return (
@@ -36,10 +36,11 @@ def squeeze_problem(workcell: Workcell, purpose: str) -> str:
 
 
 def require_squeeze(workcell: Workcell, purpose: str) -> None:
-    """Refuse hands that hold by themselves.
+    """Check that the arms of a workcell press the payload between them.
 
     Raises:
-        SettingsError: the arms do not press the payload between them.
+        SettingsError: the workcell has hands that hold without a squeeze; the message names the
+            purpose.
     """
     if problem := squeeze_problem(workcell, purpose):
         raise SettingsError(problem, code="needs-pads")

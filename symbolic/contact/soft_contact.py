@@ -18,29 +18,30 @@ from symbolic.records import Workcell
 from symbolic.records.cell import Uncertainty
 
 PAD_OFFSET_SHARE = 0.9
-"""Largest lateral offset of the pads over friction times their distance: the line between them then
-lies well within their friction cones, so that pressing harder balances any moment."""
+"""Largest lateral offset of the pads, over friction times their distance. The line between the pads
+is then well within both friction cones, so pressing harder balances any moment."""
 
 LARGEST_DISPLACEMENT = 0.2
-"""Largest displacement of pads with any normals in which forces are computed, over the least
+"""Largest displacement for which forces of pads with any normals are computed, over the least
 distance between two pads of different robots."""
 
 
 def soft_finger(workcell: Workcell) -> ContactModel:
-    """Return the model of a workcell's soft fingers; it has a closed form for two pads with
-    opposite normals."""
+    """Return the model of a workcell's soft fingers: in closed form for two pads with opposite
+    normals, else by a program."""
     return (SoftFinger if workcell.has_opposite_pads else SoftFingerGrasp)(workcell)
 
 
 class SoftFinger(ContactModel):
-    """Two pads with opposite normals and any patches."""
+    """Soft fingers: two pads with opposite normals and any patches. Forces have a closed form."""
 
     assumption = "pads that press evenly, on arms that keep their orientation"
     has_elastic_layers = True
 
     @property
     def problem(self) -> Problem | None:
-        """See `ContactModel`."""
+        """Key and message if the pads are offset too far laterally to hold the payload, else
+        None."""
         friction = min(contact.friction for contact in self.workcell.contacts)
         beside, room = self.workcell.pad_offset, friction * self.workcell.pad_distance
         if beside < PAD_OFFSET_SHARE * room:
@@ -58,7 +59,8 @@ class SoftFinger(ContactModel):
         implicit: ImplicitVariables | None = None,
         displaced: bool = False,
     ) -> HeldLoad:
-        """See `ContactModel`. No shift; torsion in proportion to what either pad can carry."""
+        """Return the least forces that balance a load. The pressure does not shift. Both pads share
+        the torsion in proportion to what each can bear."""
         workcell, axes = self.workcell, load.axes
         in_box = workcell.contacts[0].T_box_pad[:3, :3]
         patches = [SoftPatch.of(contact, in_box) for contact in workcell.contacts]
@@ -92,13 +94,13 @@ class SoftFinger(ContactModel):
 
 class SoftFingerGrasp(SoftFinger):
     """Soft fingers with any normals, also several per arm. The program of `symbolic.contact.grasp`
-    finds their forces."""
+    computes their forces."""
 
     has_closed_form = False
 
     @property
     def problem(self) -> Problem | None:
-        """See `ContactModel`."""
+        """Key and message if friction does not close the grasp, else None."""
         if has_force_closure(self.workcell):
             return None
         return (
@@ -110,28 +112,32 @@ class SoftFingerGrasp(SoftFinger):
         )
 
     def friction_lost(self, apart: Array) -> Array:
-        """See `ContactModel`. Displacements have their own cases."""
+        """Return zero: displacements have cases of their own."""
         return 0.0 * apart
 
     def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
-        """See `ContactModel`. To first order no displacements are worse than the corners of squares
-        about their discs."""
+        """Return half-widths (3,) of the range of the centre of mass [m], and the corners (k, 4)
+        [m] of squares around the discs of the pads' displacements. To first order no displacements
+        are worse."""
         off = uncertainty.pad_position + uncertainty.apart / 2.0
         signs = product((-1.0, 1.0) if off > 0.0 else (0.0,), repeat=4)
         return uncertainty.centre_of_mass, np.array([off * np.array(at) for at in signs])
 
     def displacement_margin(self, uncertainty: Uncertainty) -> float:
-        """See `ContactModel`."""
+        """Return the distance by which displacements may still grow until forces can no longer be
+        computed [m]; zero or less if the uncertainty exceeds the range."""
         off = uncertainty.pad_position + uncertainty.apart / 2.0
         return LARGEST_DISPLACEMENT * least_distance(self.workcell) - off
 
     @property
     def leading_share(self) -> Array:
-        """See `ContactModel`: that of the initial squeeze of `GraspSqueeze`."""
+        """Rise of the leading robot's force per newton of the other robot's commanded force (2,),
+        in the initial squeeze of `GraspSqueeze`."""
         normals = GraspSqueeze(self.workcell, 1).squeeze_normals()
         return np.asarray(normals / normals[::-1])
 
     def internal_force_ratio(self, leader: int) -> Array:
-        """See `ContactModel`: an internal squeeze of the pads."""
+        """Return the rise (2,) of both robots' forces in an internal squeeze of the pads, per
+        newton that the force-controlled robot presses more."""
         normals = Grasp(self.workcell).squeeze_normals()
         return np.asarray(normals / normals[1 - leader])

@@ -37,18 +37,20 @@ from symbolic.records import Contact
 from symbolic.records.numbered import NumberedContact
 
 GRIP_NEWTON_STEPS = 3
-"""Newton steps for given tangential forces, from `_first_grip`. Relative errors of forces are then
-below 1e-6, or 1e-9 for pads of equal size. `ImplicitVariables` with two steps replaces one."""
+"""Number of Newton steps for given tangential forces, from `_first_grip`. Relative errors of forces
+are then below 1e-6, or 1e-9 for pads of equal size. `ImplicitVariables` with two steps replaces
+one."""
 
 LEAST_GRIP = 0.05
-"""Least initial grip over the grip that the first pad needs for all torsion: without grip, torsion
-has no slope, and a Newton step leads far away."""
+"""Smallest initial grip, over the grip that the first pad needs for all torsion. Without grip,
+torsion has no slope and a Newton step leads far away."""
 
 OFFSET_STEPS = 7
-"""Secant steps for laterally offset pads."""
+"""Number of secant steps for laterally offset pads."""
 
 LEAST_SLOPE = 1e-3
-"""Least slope of those steps: nothing holds if a harder squeeze needs nearly as much more."""
+"""Smallest slope of the secant steps. Nothing holds if a harder squeeze needs nearly as much
+more."""
 
 LEVER_FLOOR = 1e-12
 """Lower bound of the slope of the torsion by the grip [m]."""
@@ -79,11 +81,11 @@ class SoftPatch:
 
     @classmethod
     def of(cls, contact: Contact, axes: Array) -> SoftPatch:
-        """Return the patch of a contact.
+        """Return the patch of a contact in the tangential axes of contact 1.
 
         Args:
-            contact: with a round or rectangular patch.
-            axes: (3, 3) of contact 1 in the box frame.
+            contact: contact with a round or rectangular patch.
+            axes: (3, 3) tangents and normal of contact 1 in the box frame, as columns.
         """
         if isinstance(contact, NumberedContact):
             return cls(contact.twist, contact.spread)
@@ -99,13 +101,13 @@ class SoftPatch:
 
 @dataclass(frozen=True)
 class SoftFingers:
-    """Forces of both contacts, in the coordinates of the module.
+    """Forces of both contacts, along the tangents a, b and the normal n of contact 1.
 
     Attributes:
         normal: (2,) N_1, N_2 [N].
         tangent_1, tangent_2: (2,) tangential forces on the box [N].
-        torsion: moment about n that both bear together [N m].
-        capacity: (2,) torsion that each could bear beside its tangential force [N m].
+        torsion: moment about n that both contacts bear together [N m].
+        capacity: (2,) torsion that each contact could bear beside its tangential force [N m].
     """
 
     normal: Expression
@@ -118,12 +120,13 @@ class SoftFingers:
 def torsion_capacity(
     grip: Expression, tangent: Expression, patch: SoftPatch
 ) -> tuple[Expression, Expression]:
-    """Compute the right side of (1) [N m], and its derivative by sqrt(grip^2 - |tangent|^2) [m].
+    """Compute the torsion that a pad can bear, the right side of (1) [N m], and its derivative by
+    sqrt(grip^2 - |tangent|^2) [m].
 
     Args:
         grip: sqrt(mu^2 N^2 - |T|^2), the friction left beside the tangential force [N].
         tangent: (2,) tangential force [N].
-        patch: of the pad.
+        patch: patch of the pad.
     """
     return _capacity(grip, _squared(tangent), patch.twist, _half_spread(patch, tangent))
 
@@ -131,7 +134,8 @@ def torsion_capacity(
 def _capacity(
     grip: Expression, squared: Expression, twist: Expression, half: Expression
 ) -> tuple[Expression, Expression]:
-    """Compute `torsion_capacity` from the squared tangential force [N^2], c and h / 2 [m]."""
+    """Compute `torsion_capacity` from the grip, the squared tangential force [N^2], c and h / 2
+    [m]."""
     s = grip**2 / (grip**2 + squared)
     bend = BEND * twist
     # h / 2 + s (c - h / 2) - bend s (1 - s)
@@ -146,7 +150,7 @@ def _squared(tangent: Expression) -> Expression:
 
 
 def _half_spread(patch: SoftPatch, tangent: Expression) -> Expression:
-    """Compute h / 2 of (1) [m]."""
+    """Compute h / 2 of (1) for a tangential force [m]."""
     spread = ca.mtimes(number(patch.spread), tangent)
     return ca.sqrt(ca.sumsqr(spread) / _squared(tangent) + 1e-24) / 2.0
 
@@ -163,20 +167,22 @@ def least_soft_squeeze(
     """Compute the forces with the least squeeze that balances a load.
 
     Args:
-        force, moment: (3,) of the contacts on the payload, about its centre of mass [N, N m].
+        force, moment: (3,) force and moment of both contacts on the payload, about its centre of
+            mass [N, N m].
         arms: (3,) each, from the centre of mass to the contacts [m].
         friction: (2,) Coulomb coefficients.
-        patches: of both pads.
-        offset: the contacts may be laterally offset; tangential forces and torsion then depend on
-            the squeeze.
-        implicit: see `symbolic.contact.model.ImplicitVariables`; unused with `offset`.
+        patches: patches of both pads.
+        offset: True if the contacts may be laterally offset. Tangential forces and torsion then
+            depend on the squeeze.
+        implicit: collector of results of Newton's method, for exact derivatives; unused with
+            `offset`.
     """
     apart = arms[0] - arms[1]
     # About the middle of the contacts: apart x half the difference of both forces, and torsion.
     rest = moment - ca.cross((arms[0] + arms[1]) / 2.0, force)
 
     def shared(squeeze: Expression) -> Load:
-        """Compute the loads of both contacts for N_1 + N_2 = squeeze."""
+        """Compute the loads of both contacts for a sum `squeeze` of the normal forces."""
         half = ca.vertcat(
             (rest[1] + apart[0] * squeeze / 2.0) / apart[2],
             (apart[1] * squeeze / 2.0 - rest[0]) / apart[2],
@@ -215,10 +221,10 @@ def _pressed(
     tangential forces.
 
     Args:
-        load: tangential force (2,) of each contact, and the torsion.
-        difference: N_1 - N_2.
-        friction, patches: of both pads.
-        implicit: see `symbolic.contact.model.ImplicitVariables`.
+        load: tangential force (2,) of each contact [N], and the torsion of both together [N m].
+        difference: N_1 - N_2 [N].
+        friction, patches: friction coefficients (2,) and patches of both pads.
+        implicit: collector of results of Newton's method, for exact derivatives.
     """
     *tangents, torsion = load
     asked, squares = ca.fabs(torsion), [_squared(tangent) for tangent in tangents]
@@ -237,7 +243,7 @@ def _pressed(
     share, ahead = mu[1] / mu[0], mu[0] * beyond
 
     def other_grip_squared(bound: Expression) -> Expression:
-        """Compute the squared grip of the second pad from mu N of the first [N]."""
+        """Compute the squared grip of the second pad [N^2] from mu N of the first [N]."""
         return ca.fmax((share * (bound + ahead)) ** 2 - squared[1], 0.0) + FORCE_FLOOR**2
 
     def newton(grip: Expression) -> Expression:
@@ -276,11 +282,11 @@ def _first_grip(
     """Estimate the grip of the pad that slips first [N], with torsion levers linear in s.
 
     Args:
-        asked: absolute torsion of both pads together.
-        levers: c and h / 2 of both pads; in all pairs the pad that slips first comes first.
+        asked: absolute torsion of both pads together [N m].
+        levers: c and h / 2 of both pads [m]. In all pairs the pad that slips first comes first.
         share: friction of the other pad over that of the first.
-        squared: squares of the tangential forces.
-        ahead: squared grip of the other pad when the first begins to slide without torsion.
+        squared: squares of both tangential forces [N^2].
+        ahead: squared grip of the other pad when the first begins to slide without torsion [N^2].
     """
     twist, half = levers
     # As if the other pad had the same normal force, and the first no tangential force.

@@ -1,15 +1,15 @@
 """Normal forces of pads with any normals on their program's central path, with exact derivatives.
 
-The least effort has kinks in the load, where a cone begins or ceases to be tight. At a weight mu of
-the barriers, the states s of all patches, affine in the load w and in the free components y,
-minimise
+The least effort has kinks in the load, where a cone begins or ceases to be tight. With a weight mu
+of the barriers, the states s of all patches, which are affine in the load w and in the free
+components y, minimise
 
     f(y, w) = log effort(s) + mu * sum of the patches' barriers,    s = Y y + W w.
 
 This is the central path of `symbolic.contact.central_path` with weight over effort equal to mu. The
-solution is smooth, and homogeneous in the load like the least effort. Its effort exceeds the least
-one by at most mu times the patches' degrees, relatively; its normal forces C s tend to those of
-least effort. By the implicit function theorem, with F = D^2 f and T = D^3 f, both by s,
+solution is smooth, and homogeneous in the load like the least effort. The relative excess of its
+effort over the least effort is at most mu times the patches' degrees; its normal forces C s tend to
+those of least effort. By the implicit function theorem, with F = D^2 f and T = D^3 f, both by s,
 
     Y' F Y dy = -Y' F W dw,    U = ds/dw = Y dy/dw + W,    d(C s)/dw = C U,
     d^2(weight . C s)/dw^2 = U' T[d] U,    Y' F Y p = -Y' C' weight,    d = Y p.
@@ -28,21 +28,22 @@ from symbolic.contact.grasp import SCALE_FLOOR, Grasp, full_wrench
 from symbolic.expression import as_mx, mx_symbols
 
 POLISH_STEPS = 2
-"""Newton steps of f itself, from the central path's iterate, which lies a tenth of a per mille of
-the barriers' scale from its minimum or nearer."""
+"""Number of Newton steps on f from the iterate of the central path, which is within a tenth of a
+per mille of the barriers' scale of its minimum."""
 
 ROBOTS = 2
 
 
 class SoftGrasp:
-    """The program of a grasp's pads at their nominal friction, at one weight of the barriers. The
-    last inputs of its functions are the grasp's symbolic parameters.
+    """The program of a grasp's pads at nominal friction with one weight of the barriers. The last
+    inputs of all its functions are the grasp's symbolic parameters.
 
     Attributes:
         grasp: the pads.
-        weight: mu.
-        size, ends: size of the states of all patches together, and the first entry of each.
-        normals: C (2, size).
+        weight: weight mu of the barriers.
+        size, ends: size of the states of all patches together, and index of the first entry of
+            each.
+        normals: matrix C (2, size) from states to both robots' normal forces.
     """
 
     def __init__(self, grasp: Grasp, weight: float) -> None:
@@ -54,8 +55,8 @@ class SoftGrasp:
         self.normals = ca.sparsify(ca.DM(normals))
 
     def first(self) -> ca.Function:
-        """Build the function from load (6,), see `symbolic.contact.grasp.grasp_wrenches`, to the
-        normal forces (2,) of the robots [N], their gradients slope (6, 2), and state (size,)."""
+        """Build the function from a load (6,) about the box frame's origin, box axes, to the normal
+        forces (2,) of the robots [N], their gradients slope (6, 2), and state (size,)."""
         load, handed = ca.MX.sym("load", LOAD_SIZE), mx_symbols(self.grasp.given)
         state = self.solve(load, handed)
         outputs = [*self.slopes()(state, *handed.values()), state]
@@ -63,10 +64,11 @@ class SoftGrasp:
         return ca.Function("held_first", inputs, outputs, names, ["normal", "slope", "state"])
 
     def solve(self, load: ca.MX, handed: dict[str, ca.MX]) -> ca.MX:
-        """Build the state (size,) that balances a load (6,).
+        """Build the expression of the state (size,) that balances a load (6,).
 
         Args:
-            handed: the symbolic parameters.
+            load: (6,) force and moment about the box frame's origin, along the box's axes [N, N m].
+            handed: symbolic parameters of the grasp.
         """
         given = list(handed.values())
         friction = as_mx(self.grasp.friction, self.grasp.given, handed)
@@ -78,9 +80,8 @@ class SoftGrasp:
         return state
 
     def wrenches(self, slopes: bool) -> ca.Function:
-        """Build the function from state (size,) to the wrenches (6 k,) of all pads, see
-        `symbolic.contact.grasp.grasp_wrenches`, and with `slopes` to their derivatives (6 k, 6) by
-        the load."""
+        """Build the function from a state (size,) to the wrenches (6 k,) of all k pads along the
+        pads' axes. With `slopes` it also returns their derivatives (6 k, 6) by the load."""
         state = ca.SX.sym("state", self.size)
         own = wrenches_of(self.grasp, ca.vertsplit(state, self.ends))
         units = [self.grasp.units(i, self.grasp.friction) * wrench for i, wrench in enumerate(own)]
@@ -92,8 +93,8 @@ class SoftGrasp:
         return ca.Function("held_wrenches", [state, *self.grasp.given.values()], results)
 
     def second(self) -> ca.Function:
-        """Build the function from state (size,) and weight (2,) to curvature (6, 6), the weighted
-        second derivatives of the normal forces by the load."""
+        """Build the function from a state (size,) and weights (2,) to the weighted sum (6, 6) of
+        the normal forces' second derivatives by the load."""
         state, weight = ca.SX.sym("state", self.size), ca.SX.sym("weight", ROBOTS)
         local = _Local(self, state)
         along = local.solve(-ca.mtimes(self.normals.T, weight))
@@ -107,8 +108,8 @@ class SoftGrasp:
         )
 
     def slopes(self) -> ca.Function:
-        """Build the function from a state to both normal forces and their gradients (6, 2) by the
-        load."""
+        """Build the function from a state to both robots' normal forces (2,) [N] and their
+        gradients (6, 2) by the load."""
         state = ca.SX.sym("state", self.size)
         by_load = _Local(self, state).by_load()
         outputs = [ca.mtimes(self.normals, state), ca.mtimes(self.normals, by_load).T]
@@ -116,7 +117,7 @@ class SoftGrasp:
         return ca.Function("slopes", inputs, ca.cse([ca.densify(value) for value in outputs]))
 
     def _newton(self) -> ca.Function:
-        """Build a Newton step of a state under the same load."""
+        """Build the function of one Newton step of a state at a fixed load."""
         state = ca.SX.sym("state", self.size)
         local = _Local(self, state)
         inputs = [state, *self.grasp.given.values()]
@@ -124,11 +125,11 @@ class SoftGrasp:
 
 
 class _Local:
-    """Derivatives of f at a state: those of the barriers, patch by patch, and those of log effort.
-    The latter's curvature Q / effort - g g' is a rank-one change of a diagonal.
+    """Derivatives of f at a state: of the barriers, patch by patch, and of log effort. The
+    curvature of log effort, Q / effort - g g', is a rank-one change of a diagonal.
 
     Attributes:
-        slope: gradient (n,) of f: g plus the barriers'.
+        slope: gradient (n,) of f, the sum of g and the gradient of the barriers.
     """
 
     def __init__(self, program: SoftGrasp, state: ca.SX) -> None:
@@ -146,15 +147,15 @@ class _Local:
         self._share = 1.0 / (1.0 - ca.dot(self._g, self._answer))
 
     def solve(self, pull: ca.SX) -> ca.SX:
-        """Compute Y y (n,) of Y' F Y y = Y' pull."""
+        """Solve Y' F Y y = Y' pull and return Y y (n,)."""
         return self._with_g(self._effort * self._equations.balanced_change(pull))
 
     def by_load(self) -> ca.SX:
-        """Compute U (n, 6), the derivatives of the state by the load."""
+        """Compute the derivatives U (n, 6) of the state by the load."""
         return self._with_g(self._equations.constrained(self._loaded))
 
     def _with_g(self, found: ca.SX) -> ca.SX:
-        """Correct solutions (n, k) without g g' by the Sherman-Morrison formula."""
+        """Add the term g g' to solutions (n, k) without it, by the Sherman-Morrison formula."""
         return found + ca.mtimes(self._answer, self._share * ca.mtimes(self._g.T, found))
 
     def third(self, along: ca.SX, by_load: ca.SX) -> ca.SX:

@@ -1,22 +1,22 @@
-"""Least force that holds a moving payload in one case of an uncertainty set.
+"""Least force that holds a moving payload in one case of an uncertainty.
 
 A case states the true friction, mass, centre of mass, pad positions and disturbance. The payload's
 inertia is taken about the nominal centre of mass and grows with the mass. So the required force and
 moment are affine in the centre of mass and in the disturbance separately.
 
-Of opposite pads it is the least squeeze. Of pads with any normals it is the least force of one
-robot, a linear objective in the program of `symbolic.contact.grasp`. That force is commanded before
-the case is known. An internal squeeze can be added to any wrenches that balance the load, so that
-more than the least force holds the load as well.
+For opposite pads this is the least squeeze. For pads with any normals it is the least force of one
+robot, a linear objective in the program of `symbolic.contact.grasp`. This force is commanded before
+the case is known. An internal squeeze can be added to any wrenches that balance the load, so a
+larger force holds the load too.
 
 `ContactModel.command_model` is the contact model of commanded forces: arms that command a normal
 force alone have pads that press evenly about their displaced places, whichever pads the plan
 assumes.
 
 The commanded force is larger than the least force: a share of it may be missing, and the arms may
-work against each other. With N a pad's least normal force, e the missing share and T the opposed
-tangential force, it is (N + T / mu) / (1 - e). Friction cones are convex and contain (T / mu, T),
-so that N + T / mu holds for every direction of T; it is the least such force if the pad bears no
+push against each other. With N a pad's least normal force, e the missing share and T the tangential
+force between the arms, it is (N + T / mu) / (1 - e). Friction cones are convex and contain (T / mu,
+T), so N + T / mu holds for every direction of T. It is the least such force if the pad bears no
 torsion and T acts along its load.
 """
 
@@ -58,10 +58,11 @@ CASE_SIZES = {
     "tracking": 2,
     "internal": 1,
 }
-"""Parts of a case, in order: coefficients; radii of the patches [m]; mass [kg]; centre of mass in
-the box frame [m]; acceleration beside the motion's, world frame [m/s^2]; displacements of both
-pads along the tangents of contact 1 [m], of pads with any normals along their own; missing share of
-each robot's commanded normal force, zero for the leading one; opposed tangential force [N]."""
+"""Parts of a case and their sizes, in order: friction coefficients; radii of the patches [m]; mass
+[kg]; centre of mass in the box frame [m]; acceleration beside the motion's, world frame [m/s^2];
+displacements of both pads [m], along the tangents of contact 1, or along their own tangents for
+pads with any normals; missing share of each robot's commanded normal force, zero for the leading
+robot; tangential force between the arms [N]."""
 
 SQUARED_SPEED_FLOOR = 1e-12
 """Floor of u'^2 [1/s^2]; its effect on a force is far below rounding."""
@@ -69,21 +70,23 @@ SQUARED_SPEED_FLOOR = 1e-12
 CASE_SIZE = sum(CASE_SIZES.values())
 
 MOTION = ("pose", "rate", "second_rate")
-"""Inputs of functions of cases, before the case."""
+"""Names of the inputs of a function of cases before the case itself."""
 
 
 def case_squeeze_function(
     workcell: Workcell, commanded: int = 1, displaced: bool = True
 ) -> ca.Function:
-    """Build the function of the least force in a case: pose, rate, second_rate (6,) and a case
-    (18,), see `CASE_SIZES`, to normal_force (2,) [N].
+    """Build the function of the least forces in a case.
 
-    With a scalar squeeze, both forces are least: more holds the case, less does not. Else the force
-    of the commanded robot is least, and the other one follows.
+    Inputs: pose, rate, second_rate (6,) and a case (18,) laid out by `CASE_SIZES`. Output:
+    normal_force (2,) [N]. With a scalar squeeze both forces are least: more holds the case, less
+    does not. Otherwise the force of the commanded robot is least, and the other force results from
+    it.
 
     Args:
+        workcell: the workcell.
         commanded: index of the robot whose force is commanded.
-        displaced: cases may displace the pads, which costs soft fingers more.
+        displaced: True if cases may displace the pads, which takes longer for soft fingers.
 
     Raises:
         SettingsError: no internal squeeze exists.
@@ -96,13 +99,18 @@ def case_squeeze_function(
 def case_gradient_function(
     workcell: Workcell, commanded: int = 1, numbers: bool = False
 ) -> ca.Function:
-    """Build `case_squeeze_function` with a further output slope (NumPy shape (2, 18)): derivatives
-    of each force by pose, rate and second_rate; with a scalar squeeze for cases without displaced
-    pads.
+    """Build the function of `case_squeeze_function` with derivatives, for cases without displaced
+    pads if there is a scalar squeeze.
+
+    The additional output slope (NumPy shape (2, 18)) has the derivatives of each force by pose,
+    rate and second_rate.
 
     Args:
-        numbers: append derivatives by the case (18,), and by the cell's parameters; of pads with
-            any normals by the load (6,) of `case_origin_load_function` instead of the parameters.
+        workcell: the workcell.
+        commanded: index of the robot whose force is commanded.
+        numbers: True to append derivatives by the case (18,) and by the cell's parameters. For pads
+            with any normals, derivatives by the load (6,) of `case_origin_load_function` take the
+            place of the latter.
     """
     squeeze, inputs = _program_and_inputs(workcell, commanded)
     by = [*inputs.values()] if numbers else [inputs[name] for name in MOTION]
@@ -124,10 +132,13 @@ def case_gradient_function(
 
 
 def case_slopes_function(workcell: Workcell) -> ca.Function:
-    """Build the function of forces along a path: box pose and its derivatives by u (6,), u'', u'^2
-    and a case (18,), see `CASE_SIZES`, to normal_force (2,) [N] as of `case_squeeze_function`, and
-    slope (NumPy shape (2, 20)), their derivatives by pose, both derivatives, u'' and u'^2. For
-    cases without displaced pads."""
+    """Build the function of the least forces in a case along a path, for cases without displaced
+    pads.
+
+    Inputs: box pose and its first and second derivative by u (6,), u'', u'^2, and a case (18,) laid
+    out by `CASE_SIZES`. Outputs: normal_force (2,) [N] as in `case_squeeze_function`, and slope
+    (NumPy shape (2, 20)), the derivatives by pose, both derivatives of the pose, u'' and u'^2.
+    """
     inputs = _inputs(ca.SX, sx_parameters(workcell.payload))
     path = {name: ca.SX.sym(name, 6) for name in ("pose", "first", "second")}
     path |= {"a": ca.SX.sym("a"), "w": ca.SX.sym("w")}
@@ -144,8 +155,8 @@ def case_slopes_function(workcell: Workcell) -> ca.Function:
 
 
 def case_excess_function(workcell: Workcell) -> ca.Function:
-    """Build the function from pose, rate, second_rate (6,) and a case (18,), see `CASE_SIZES`, to
-    excess [N], see `ContactModel.leading_excess`."""
+    """Build the function from pose, rate, second_rate (6,) and a case (18,) laid out by
+    `CASE_SIZES` to the output excess [N] of `ContactModel.leading_excess`."""
     inputs = _inputs(ca.SX, sx_parameters(workcell.payload))
     load, opposed = case_contact_load(workcell, inputs), case_parts(inputs["case"])[-1]
     excess = command_model(workcell).leading_excess(load, opposed)
@@ -153,11 +164,11 @@ def case_excess_function(workcell: Workcell) -> ca.Function:
 
 
 def case_slack_function(workcell: Workcell, commanded: int = 1) -> ca.Function:
-    """Build a sufficient test of a commanded force: pose, rate, second_rate (6,), a case (18,) and
-    the force [N] to slack.
+    """Build a sufficient test that a commanded force holds a case.
 
-    A positive slack proves that the force holds the case; otherwise only `case_squeeze_function`
-    can tell. The test takes a thirtieth of that function's time.
+    Inputs: pose, rate, second_rate (6,), a case (18,) and the force [N]. Output: slack. A positive
+    slack proves that the force holds the case; otherwise only `case_squeeze_function` decides. The
+    test takes a thirtieth of that function's time.
     """
     squeeze = (
         None if command_model(workcell).has_scalar_squeeze else GraspSqueeze(workcell, commanded)
@@ -183,8 +194,8 @@ def case_slack_function(workcell: Workcell, commanded: int = 1) -> ca.Function:
 def _program_and_inputs(
     workcell: Workcell, commanded: int = 1
 ) -> tuple[GraspSqueeze | None, dict[str, Expression]]:
-    """Return the program of pads with any normals, else None, and the inputs of functions of least
-    forces."""
+    """Return the program of pads with any normals, None for other pads, and the inputs of functions
+    of least forces by name."""
     if command_model(workcell).has_scalar_squeeze:
         return None, _inputs(ca.SX, sx_parameters(workcell.payload))
     squeeze = GraspSqueeze(workcell, commanded)
@@ -206,11 +217,11 @@ def _least_force(
     displaced: bool = False,
     beside: Expression | float = 0.0,
 ) -> Expression:
-    """Build the commanded normal forces (2,) [N].
+    """Build the expression of the commanded normal forces (2,) [N].
 
     Args:
-        beside: load (6,) in addition to that of the case, about the box frame's origin, for pads
-            with any normals.
+        beside: additional load (6,) about the box frame's origin [N, N m], for pads with any
+            normals.
     """
     case = inputs["case"]
     friction, *_ = case_parts(case)
@@ -231,17 +242,17 @@ def _origin_load(workcell: Workcell, inputs: dict[str, Expression]) -> Expressio
 
 
 def case_parts(case: ca.SX | ca.MX) -> list[ca.SX | ca.MX]:
-    """Split a case (18,) into its parts, see `CASE_SIZES`."""
+    """Split a case (18,) into the parts of `CASE_SIZES`."""
     return list(ca.vertsplit(case, [0, *accumulate(CASE_SIZES.values())]))
 
 
 def case_contact_load(workcell: Workcell, inputs: Mapping[str, Expression]) -> ContactLoad:
-    """Return the load of the contacts in a case, along the axes of contact 1, about the nominal
+    """Return the load on the contacts in a case, along the axes of contact 1 and about the nominal
     centre of mass.
 
     Args:
-        workcell: the cell.
-        inputs: pose, rate, second_rate (6,) and case (18,), see `CASE_SIZES`.
+        workcell: the workcell.
+        inputs: pose, rate, second_rate (6,) and case (18,) laid out by `CASE_SIZES`.
     """
     case = inputs["case"]
     friction, *_, displacement, _, _ = case_parts(case)
@@ -260,8 +271,8 @@ def case_contact_load(workcell: Workcell, inputs: Mapping[str, Expression]) -> C
 
 
 def case_load_function(workcell: Workcell) -> ca.Function:
-    """Build the function from pose, rate, second_rate and a case to the required force and moment
-    about the nominal centre of mass, (3,) each, box axes."""
+    """Build the function from pose, rate, second_rate (6,) and a case (18,) to the required force
+    and the required moment about the nominal centre of mass, (3,) each, box axes."""
     payload = workcell.payload
     inputs = [*_inputs(ca.SX, sx_parameters(payload)).values()]
     pose, rate, second, case, *_ = inputs
@@ -287,8 +298,8 @@ def _commanded_by_program(
     handed: dict[str, ca.MX],
     differentiable: bool = False,
 ) -> ca.MX:
-    """Build the commanded normal forces (2,) [N] of pads with any normals in a case with a known
-    load (6,)."""
+    """Build the expression of the commanded normal forces (2,) [N] of pads with any normals, for a
+    case with a known load (6,)."""
     friction, *_, displacement, tracking, internal = case_parts(case)
     commanded, given = squeeze.commanded, list(handed.values())
     sizes = _sizes_function(squeeze)(case, *given)
@@ -303,8 +314,8 @@ def _commanded_by_program(
 
 
 def _sizes_function(squeeze: GraspSqueeze) -> ca.Function:
-    """Build the function from a case to the sizes (2,) of the robots' patches over the cell's
-    own."""
+    """Build the function from a case to the sizes (2,) of the robots' patches over the cell's own
+    sizes."""
     case = ca.SX.sym("case", CASE_SIZE)
     radius = case_parts(case)[1]
     own = [ca.SX(number(contact.patch_radius)) for contact in squeeze.workcell.contacts]
@@ -313,8 +324,8 @@ def _sizes_function(squeeze: GraspSqueeze) -> ca.Function:
 
 
 def case_origin_load_function(workcell: Workcell) -> ca.Function:
-    """Build the function from pose, rate, second_rate and a case to the load (6,) about the box
-    frame's origin, box axes."""
+    """Build the function from pose, rate, second_rate (6,) and a case (18,) to the load (6,) about
+    the box frame's origin, along the box's axes [N, N m]."""
     inputs = [*_inputs(ca.SX, sx_parameters(workcell.payload)).values()]
     force, moment = case_load_function(workcell)(*inputs)
     about = moment + ca.cross(ca.SX(number(workcell.payload.centre_of_mass)), force)
