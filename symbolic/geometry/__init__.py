@@ -1,5 +1,6 @@
 """Collision shapes.
 
-pieces, meshes, bodies: what there is. pairs: what is checked, and why not the rest. clearance,
-covers, expressions: bounds of distances, and of the motion between two samples.
+pieces, hulls, bodies: convex pieces of all bodies. pairs: the pairs that are checked, and the
+reasons to exclude the others. clearance, covers, expressions, screen: bounds of distances, and of
+the motion between two samples.
 """

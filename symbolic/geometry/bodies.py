@@ -24,16 +24,17 @@ from symbolic.records.problems import shown
 
 Group = Literal["robot 1", "robot 2", "payload", "environment"]
 MOST_CORNERS = 100_000
-"""Most corners of all convex pieces of meshes: the sorting of pairs then takes about 15 s."""
+"""Largest accepted number of corners of all convex pieces of meshes. Sorting the pairs then takes
+about 15 s."""
 
 
 @dataclass(frozen=True)
 class Frame:
-    """Frame that a body is fixed to.
+    """Frame to which a body is fixed.
 
     Attributes:
-        kind: 'world', 'box', or 'link', behind a joint of a robot.
-        robot, joint: 0-based indices of a link's robot and joint, otherwise -1.
+        kind: 'world', 'box', or 'link' for the frame behind a joint of a robot.
+        robot, joint: indices of the robot and the joint of a link, from 0; otherwise -1.
     """
 
     kind: Literal["world", "link", "box"]
@@ -50,14 +51,15 @@ class CollisionBody(ContentRecord):
     """A named rigid body.
 
     Attributes:
-        name: environment bodies keep theirs; links and tools are 'robot/link'.
-        group: which of the four parties of the cell it belongs to.
-        frame: the frame that it is fixed to.
-        pieces: its convex pieces, in that frame.
-        is_tool: whether it is part of a robot's tool.
-        carries: arms (0, 1) of a machine that have this link as their mount, see
-            `symbolic.read.arms.ArmLinks`; None of a body that is no link, or has no such part.
-        root: of a robot's link that stands, the robot and the pieces in its root; else None.
+        name: name in the workcell file for environment bodies; 'robot/link' for links and tools.
+        group: one of the four groups of the cell: robot 1, robot 2, payload, environment.
+        frame: frame to which the body is fixed.
+        pieces: convex pieces of the body, in this frame.
+        is_tool: whether the body is part of a robot's tool.
+        carries: indices of the arms of a machine that are mounted on this link
+            (`symbolic.read.arms.ArmLinks`); None if the body is not a link or carries no arm.
+        root: for a link that does not move, the index of the robot and the pieces in the robot's
+            root frame; else None.
     """
 
     name: str
@@ -74,12 +76,13 @@ class ArmGeometry(ContentRecord):
     """The constant geometry of an arm's joints.
 
     Attributes:
-        T_world_root: (4, 4) of the URDF's root.
-        origins: (n, 4, 4), each joint's frame in the one before it (the first: in the root),
-            at joint position zero.
-        axes: (n, 3) unit axis of each joint in its own frame.
-        turning: (n,) whether a joint turns about its axis; others slide along it.
-        T_joint_box: (4, 4), the carried box in the last joint's frame.
+        T_world_root: (4, 4) root of the URDF in the world.
+        origins: (n, 4, 4) frame of each joint in the frame of the joint before it (of the first
+            joint in the root), at joint position zero.
+        axes: (n, 3) unit axis of each joint in the joint's frame.
+        turning: (n,) True for joints that turn about their axis, False for joints that slide along
+            it.
+        T_joint_box: (4, 4) carried box in the last joint's frame.
         lower, upper: (n,) joint limits [rad or m].
     """
 
@@ -93,7 +96,7 @@ class ArmGeometry(ContentRecord):
 
     @cached_property
     def chain(self) -> str:
-        """Digest of its joints, independent of its base and of the box that it holds."""
+        """Digest of the joints, independent of the arm's base and of the box that the arm holds."""
         own = self.origins, self.axes, self.turning, self.lower, self.upper
         return digest_of_parts(own)
 
@@ -104,7 +107,8 @@ class ArmGeometry(ContentRecord):
 
     @property
     def slides(self) -> Array:
-        """(n,) how far each joint may slide from position zero [m]; 0 of one that turns."""
+        """(n,) largest distance by which each joint slides from position zero [m]; 0 for a joint
+        that turns."""
         most = np.maximum(np.abs(self.lower), np.abs(self.upper))
         return np.asarray(np.where(self.turning, 0.0, most))
 
@@ -114,10 +118,11 @@ def collision_bodies(
 ) -> tuple[CollisionBody, ...]:
     """Return all bodies: robot 1, robot 2, payload, environment, each in the order of its file.
 
-    What stands still of a robot that is a chain of a larger machine counts as environment.
+    If a robot is part of a larger machine, the links of the machine that do not move count as
+    environment.
 
     Args:
-        meshes: reads the meshes; None for a new one.
+        meshes: reader of the meshes; None for a new one.
 
     Raises:
         CollisionModelError: a shape or mesh is unusable, or two bodies share a name.
@@ -176,7 +181,8 @@ def arm_geometry(workcell: Workcell, i: int) -> ArmGeometry:
 
 
 def _check_effort(bodies: list[CollisionBody], most_pieces: int) -> None:
-    """Refuse more pieces and corners than sorting the pairs handles in some seconds."""
+    """Check that the number of pieces and corners is small enough for sorting the pairs in some
+    seconds."""
     pieces = sum(len(body.pieces) for body in bodies)
     largest = max(bodies, key=lambda body: len(body.pieces))
     if pieces > most_pieces:
@@ -228,7 +234,7 @@ def _robot_bodies(robot: Robot, i: int, links: ArmLinks, meshes: MeshReader) -> 
 def _standing_bodies(
     robots: tuple[Robot, Robot], i: int, links: tuple[ArmLinks, ArmLinks], meshes: MeshReader
 ) -> list[CollisionBody]:
-    """Return the bodies of arm i's machine that stand still."""
+    """Return the bodies of arm i's machine that do not move."""
     robot, bodies = robots[i], []
     if not robot.chain_root:
         return []
@@ -244,7 +250,7 @@ def _standing_bodies(
 
 
 def _attachment(model: pin.Model, link: str, robot: Robot, i: int) -> tuple[Frame, Array]:
-    """Return the frame that a link is fixed to and the link's pose in it."""
+    """Return the frame to which a link is fixed, and the link's pose (4, 4) in this frame."""
     frame = model.frames[link_frame(model, link)]
     placement: Array = frame.placement.homogeneous
     if frame.parentJoint == 0:
@@ -255,8 +261,8 @@ def _attachment(model: pin.Model, link: str, robot: Robot, i: int) -> tuple[Fram
 def _link_pieces(
     robot: Robot, links: Collection[str], meshes: MeshReader
 ) -> dict[str, tuple[Piece, ...]]:
-    """Return the collision pieces of some links of a URDF, in the link's frame and the file's
-    order."""
+    """Return the collision pieces of some links of a URDF, in the frame of each link and in the
+    order of the file."""
     found_pieces = {}
     for link, collisions in robot_urdf(robot).collisions.items():
         if link not in links:
@@ -286,11 +292,11 @@ def _located(mesh: UrdfMesh, robot: Robot, owner: str) -> Mesh:
 
 
 class MeshReader:
-    """Reader of a cell's meshes: each is read and decomposed once, within `MOST_CELL_FACES`
-    together.
+    """Reader of a cell's meshes. Each mesh is read and decomposed once. All together may have at
+    most `MOST_CELL_FACES` triangles.
 
     Attributes:
-        known: by file and scale.
+        known: decomposed meshes by file and scale.
     """
 
     def __init__(self) -> None:
@@ -300,8 +306,8 @@ class MeshReader:
         """Return the convex pieces of a mesh.
 
         Raises:
-            CollisionModelError: see `symbolic.read.meshes.read_mesh`; and all meshes so far
-                have too many triangles.
+            CollisionModelError: the mesh cannot be read or decomposed, or all meshes so far have
+                too many triangles.
         """
         # Not imported at the top: trimesh takes long to start, and most cells have no meshes.
         from symbolic.read.meshes import MOST_CELL_FACES
@@ -321,8 +327,8 @@ class MeshReader:
 
 
 def _state(path: Path) -> tuple[int, int]:
-    """Return a file's modification time and size; zeros if it is missing, which reading it then
-    reports."""
+    """Return a file's modification time and size; zeros if the file is missing, which reading it
+    reports later."""
     try:
         found = path.stat()
     except OSError:
@@ -334,7 +340,8 @@ def _state(path: Path) -> tuple[int, int]:
 def _cut_file(path: Path, scale: tuple[float, ...], state: tuple[int, int]) -> CutMesh:
     """Compute the convex pieces of a mesh file.
 
-    Kept beyond one cell: what tries a cell out reads its robots several times.
+    The result is cached beyond one cell: a process that tries many variants of a cell reads its
+    robots several times.
     """
     from symbolic.geometry.hulls import cut
     from symbolic.read.meshes import read_mesh

@@ -1,15 +1,15 @@
 """Lower bounds of the distance between the bodies of a cell, and bounds of their motion between two
 samples, as CasADi expressions.
 
-For any unit vector u, two convex bodies are at least  min_A u.x - max_B u.x  apart (a plane
-across u separates them). The bound of a pair is the largest such gap over a few directions:
-the axes of the environment's box, of the payload, and the world's. In an arm's own pairs, and
-against round shapes of the environment, chains of spheres are used instead, or as well.
-Positive means surely free by that distance; anything else means nothing. All fifteen axes of box
-against box cost more than the FCL calls that they save.
+For any unit vector u, two convex bodies are at least  min_A u.x - max_B u.x  apart (a plane across
+u separates them). The bound of a pair is the largest such gap over a few directions: the axes of
+the environment's box, of the payload, and of the world. For pairs of one arm, and against round
+shapes of the environment, chains of spheres are used instead or in addition. A positive bound
+proves that the bodies are apart by this distance; any other bound proves nothing. All fifteen axes
+of box against box would cost more than the FCL calls that they save.
 
-Between two samples the joints and the box's position and angles move linearly. A body's point
-x(s), 0 <= s <= 1, then stays within
+Between two samples the joints and the box's position and angles change linearly. A point x(s) of a
+body, 0 <= s <= 1, then stays within
 
   |x(s) - x(0)| <= s D + s (1 - s) / 2 K,      |x(s) - x(1)| <= (1 - s) D + s (1 - s) / 2 K,
 
@@ -17,11 +17,11 @@ where the chord D bounds |x(1) - x(0)| and the bend K bounds |x''|. For the bodi
 
   |x''| <= sum_ij |dq_i| |dq_j| r_max(i,j),
 
-with r_j the largest distance of the body's points from the axis of joint j. Where a joint slides,
-r_j = 1 bounds the motion by it, and in x'' it counts with the joints that turn before it only: what
-slides along a fixed line does not bend. Of the box |x''| <= r (sum_i |da_i|)^2, da_i the steps of
-its three numbers: for angles as for joints, and for a rotation vector v = v_0 + s d by Duhamel's
-formula, |exp(v)''| = 2 |integral of exp d exp d exp over a triangle of area 1/2| <= |d|^2.
+with r_j the largest distance of the body's points from the axis of joint j. For a sliding joint r_j
+= 1, and in x'' it counts only together with turning joints before it: motion along a fixed line
+does not bend. For the box |x''| <= r (sum_i |da_i|)^2, with da_i the steps of its three numbers:
+for angles as for joints, and for a rotation vector v = v_0 + s d by Duhamel's formula, |exp(v)''| =
+2 |integral of exp d exp d exp over a triangle of area 1/2| <= |d|^2.
 """
 
 from __future__ import annotations
@@ -60,16 +60,17 @@ def screening_functions(
 ) -> dict[str, ca.Function]:
     """Build the functions that collision checking calls, by name.
 
-    The first two take pose (6,), q_1 and q_2 (n,) [m, rad] of one sample.
-    clearance: -> clearance (n_near,), lower bounds of the distances of the possible pairs that are
-    near [m], in order. far_clearance: the same bounds for the other possible pairs, if any [m].
-    piece_poses: -> quaternions (4, n_pieces) as w x y z, positions (3, n_pieces) [m]: every
-    piece of every body in the world, in the bodies' order.
-    motion, far_motion: see `symbolic.geometry.clearance.motion_function`.
+    The first two take pose (6,), q_1 and q_2 (n,) [m, rad] of one sample. clearance: -> clearance
+    (n_near,), lower bounds of the distances of the possible pairs that are near [m], in order.
+    far_clearance: the same bounds for the other possible pairs, if any [m]. piece_poses: ->
+    quaternions (4, n_pieces) as w x y z, positions (3, n_pieces) [m]: every piece of every body in
+    the world, in the bodies' order. motion, far_motion: the functions of `motion_function` for near
+    and other pairs.
 
     Args:
-        softness: `EXACT` for screening; `Softness(width)` for bounds that are smooth, and lower
-            by some multiples of the width [m].
+        geometry: bodies and pairs of the cell.
+        softness: `EXACT` for screening; `Softness(width)` for smooth bounds that are lower by a few
+            widths [m].
         joint_placements: the function `RobotModel.joint_placements` of each robot.
         screen: screen of the geometry, with numbers or symbols; None to compute the screen here.
     """
@@ -108,11 +109,11 @@ def screening_functions(
 
 
 def _piece_pose(placed: tuple[ca.SX, ca.SX] | None, turn: Any, centre: Any) -> tuple[ca.SX, ca.SX]:
-    """Compute the unit quaternion (4,) and position (3,) in the world of a piece, see
-    `ScreenBody.pieces`.
+    """Compute the unit quaternion (4,) and the position (3,) of a piece of `ScreenBody.pieces` in
+    the world.
 
     Args:
-        placed: rotation and position of its frame; None of what stands.
+        placed: rotation and position of the piece's frame; None if the piece does not move.
     """
     position = ca.SX(number(centre))
     if placed is None:
@@ -125,7 +126,7 @@ def _piece_pose(placed: tuple[ca.SX, ca.SX] | None, turn: Any, centre: Any) -> t
 
 
 BOX_NUMBERS = 15
-"""Length of `box_numbers`."""
+"""Number of entries of `box_numbers`."""
 
 
 def box_numbers(body: CollisionBody) -> Array:
@@ -138,7 +139,7 @@ def box_numbers(body: CollisionBody) -> Array:
 
 
 class DistanceBounds:
-    """Distance bounds of one sample; every expression is built once and shared."""
+    """Expressions of distance bounds of one sample. Each expression is built once and shared."""
 
     def __init__(
         self,
@@ -151,10 +152,11 @@ class DistanceBounds:
         """Store the placements; expressions are built on demand.
 
         Args:
-            R_box, p_box: (3, 3) and (3,), the box in the world.
-            placements: per robot the rotations (3, 3 n) and positions (3, n) of its joint frames in
-                its root, side by side, as `RobotModel.joint_placements` gives them.
-            softness: see `screening_functions`.
+            screen: bodies and pairs of the cell.
+            R_box, p_box: (3, 3) rotation and (3,) position of the box in the world.
+            placements: for each robot the rotations (3, 3 n) and positions (3, n) of the joint
+                frames in the root, side by side, from `RobotModel.joint_placements`.
+            softness: `EXACT`, or the width of smooth bounds.
         """
         self.screen, self.soft = screen, softness
         self._placed: dict[Frame, tuple[ca.SX, ca.SX]] = {
@@ -193,7 +195,8 @@ class DistanceBounds:
         return self.soft.maximum_below(gaps)
 
     def separable(self, pair: int) -> bool:
-        """Return True if a possible pair is the payload and an obstacle of one box."""
+        """Return True if a possible pair consists of the payload, a box, and an obstacle that is a
+        single box."""
         first, second = (self.screen.bodies[body] for body in self.screen.pairs[pair])
         kinds = [obstacle.kind for obstacle in second.obstacles]
         return first.group == "payload" and kinds == [Box]
@@ -223,11 +226,12 @@ class DistanceBounds:
         return list(zip(self._interval(i, axes), self._interval(j, axes), strict=True))
 
     def _gap(self, pairs: Sequence[tuple[Interval, Interval]]) -> ca.SX:
-        """Compute the largest separation over directions from both bodies' intervals."""
+        """Compute the largest gap over several directions, from the intervals of both bodies along
+        each direction."""
         return self.soft.maximum_below(_gaps(pairs))
 
     def _interval(self, index: int, axes: Axes) -> list[Interval]:
-        """Compute a body's extent per direction."""
+        """Compute the extent of a body along each direction."""
         key = (index, axes.key)
         body = self.screen.bodies[index]
         if body.extent is not None and axes is self._world:
@@ -245,15 +249,16 @@ class DistanceBounds:
         return self._intervals[key]
 
     def _piece_interval(self, A: ca.SX, offset: ca.SX, piece: CoverSolid) -> list[Interval]:
-        """Compute the extent of a cover piece along the rows of A, with its frame's origin at
-        offset."""
+        """Compute the extent of a cover piece along the rows of A, with the origin of the piece's
+        frame at `offset`."""
         middle = ca.mtimes(A, ca.SX(number(piece.centre))) + offset
         seen = A if piece.rotation is None else ca.mtimes(A, turned(piece.rotation))
         reach = [self._reach(seen[k, :], piece) for k in range(3)]
         return [(middle[k] - reach[k], middle[k] + reach[k]) for k in range(3)]
 
     def _reach(self, u: ca.SX, piece: CoverSolid) -> ca.SX:
-        """Compute the support of a piece about its centre along u (1, 3) in its own axes."""
+        """Compute the largest extent of a piece from its centre along u (1, 3), in the piece's own
+        axes."""
         size = ca.SX(number(piece.size))
         if piece.kind is Box:
             return sum((size[k] * self.soft.entry_above(u[k]) for k in range(3)), ca.SX(0))
@@ -277,7 +282,7 @@ class DistanceBounds:
         return Axes(str(frame), self._placed[frame][0].T)
 
     def _chain(self, index: int) -> tuple[list[ca.SX], ca.SX]:
-        """Compute the centres in the world and the radius of a body's chain of spheres."""
+        """Compute the centres, in the world, and the radius of a body's chain of spheres."""
         body = self.screen.bodies[index]
         assert body.chain is not None, "obstacles have no chains"
         if index not in self._chains:
@@ -287,19 +292,20 @@ class DistanceBounds:
         return self._chains[index], ca.SX(number(body.chain.radius))
 
     def _nearest(self, squared: Sequence[ca.SX]) -> ca.SX:
-        """Compute the root of the least of some squared distances."""
+        """Compute the root of the smallest of several squared distances."""
         if self.soft.width:
             return self.soft.minimum_below([self.soft.norm_below(s) for s in squared])
         return self.soft.norm_below(self.soft.minimum_below(squared))
 
     def _chain_bound(self, i: int, j: int) -> ca.SX:
-        """Bound the distance of two chains of spheres: the nearest centres less both radii."""
+        """Return a lower bound of the distance of two chains of spheres: the distance of the
+        nearest centres minus both radii."""
         (first, r_1), (second, r_2) = self._chain(i), self._chain(j)
         return self._nearest([ca.sumsqr(a - b) for a in first for b in second]) - (r_1 + r_2)
 
     def _near_bound(self, i: int, j: int) -> ca.SX:
-        """Bound the distance piece by piece, along the axes of the first body's frame, or the
-        world's if it stands still."""
+        """Return a lower bound of the distance of two bodies piece by piece, along the axes of the
+        first body's frame, or of the world if this body does not move."""
         first, second = self.screen.bodies[i], self.screen.bodies[j]
         stands = first.extent is not None
         axes = self._world if stands else self._own_axes(first.frame)
@@ -317,7 +323,8 @@ class DistanceBounds:
         )
 
     def _box_bound(self, link: int) -> ca.SX:
-        """Bound the distance between a chain of spheres and the payload's bounding box."""
+        """Return a lower bound of the distance between a link's chain of spheres and the payload's
+        bounding box."""
         box = self.screen.payload
         half, (R, p) = ca.SX(number(box.size)), self._placed[BOX]
         if isinstance(box.centre, ca.SX) or box.centre.any():
@@ -334,7 +341,7 @@ class DistanceBounds:
         return self._nearest(squared) - radius - 3**0.5 / 2.0 * self.soft.width
 
     def _obstacle(self, index: int, other: int, k: int) -> ca.SX:
-        """Bound the distance between a moving body and piece k of an obstacle."""
+        """Return a lower bound of the distance between a moving body and piece k of an obstacle."""
         body, obstacle = self.screen.bodies[index], self.screen.bodies[other].obstacles[k]
         axes = self._world
         if obstacle.axes is not None:
@@ -350,7 +357,8 @@ class DistanceBounds:
         return self.soft.maximum_below(gaps)
 
     def _round_bound(self, index: int, obstacle: Obstacle) -> ca.SX:
-        """Bound the distance between a chain of spheres and a fixed cylinder, capsule or sphere."""
+        """Return a lower bound of the distance between a chain of spheres and a fixed cylinder,
+        capsule or sphere."""
         centres, radius = self._chain(index)
         offset, size = number(obstacle.offset), ca.SX(number(obstacle.cover.size))
         bounds = []
@@ -367,13 +375,13 @@ class DistanceBounds:
 
 
 def _ends(extent: Any, k: int) -> list[Interval]:
-    """Return, per direction, both ends of the extent in rows 2 k and 2 k + 1."""
+    """Return for each direction both ends of the extent, from rows 2 k and 2 k + 1."""
     rows = ca.SX(number(extent))
     return [(rows[2 * k, d], rows[2 * k + 1, d]) for d in range(3)]
 
 
 def _gaps(pairs: Sequence[tuple[Interval, Interval]]) -> list[ca.SX]:
-    """Compute the gaps between two intervals, in either order, for all given pairs of them."""
+    """Compute both gaps, in either order, between the two intervals of each pair."""
     return [gap for a, b in pairs for gap in (a[0] - b[1], b[0] - a[1])]
 
 
@@ -383,7 +391,7 @@ Interval = tuple[ca.SX, ca.SX]
 
 @dataclass(frozen=True)
 class Axes:
-    """Three orthogonal directions: rows of A (3, 3)."""
+    """Three orthogonal directions, the rows of A (3, 3)."""
 
     key: str
     A: ca.SX
@@ -396,11 +404,11 @@ def motion_function(
     name: str,
     pairs: Iterable[int],
 ) -> ca.Function:
-    """Build the function of two configurations -> chord, bend (n_pairs,) [m] of some possible
+    """Build the function from two configurations to chord and bend (n_pairs,) [m] of some possible
     pairs.
 
-    They are the sums of both bodies' chords and bends, see the module; of two links of one arm,
-    the length of the path of one seen from the other, which needs no bend.
+    Chord and bend are the sums over both bodies, as the module defines them. For two links of one
+    arm the chord is the length of the path of one link as seen from the other; the bend is zero.
 
     Inputs: pose_a (6,), q_1_a, q_2_a (n,), then pose_b, q_1_b, q_2_b [m, rad].
 
@@ -446,7 +454,7 @@ def _body_motion(
     placed_b: dict[Frame, tuple[ca.SX, ca.SX]],
     steps: list[ca.SX],
 ) -> tuple[ca.SX, ca.SX]:
-    """Compute the chord and bend of one body."""
+    """Compute the chord and bend [m] of one body between two configurations."""
     if body.reach is None:
         return ca.SX(0), ca.SX(0)
     centre, spans = number(body.reach.centre), number(body.reach.spans)
@@ -462,7 +470,7 @@ def _body_motion(
 
 
 def _between_links(first: ScreenBody, second: ScreenBody, step: ca.SX) -> ca.SX:
-    """Compute the length of the path of the later link seen from the earlier one."""
+    """Compute the length of the path of the later link as seen from the earlier one [m]."""
     assert second.reach is not None, "the later of two links moves"
     reach = number(second.reach.joints)
     moving = range(first.frame.joint + 1, second.frame.joint + 1)

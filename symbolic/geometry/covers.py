@@ -1,8 +1,8 @@
-"""Covers of a body by few simple shapes, on which the compiled screening computes.
+"""Covers of a body by few simple shapes, with which the compiled screening computes.
 
-Two covers per body: `slab_cover`, boxes, cylinders, spheres and capsules with exact support
-functions, and `chain_cover`, chains of equal spheres. Both are proven to contain the body by
-exact functions of `symbolic.geometry.pieces`.
+Each body has two covers: `slab_cover` by boxes, cylinders, spheres and capsules with exact support
+functions, and `chain_cover` by a chain of equal spheres. Exact functions of
+`symbolic.geometry.pieces` prove that both contain the body.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from symbolic.records.content import CacheKey, digest_of_parts
 from symbolic.records.poses import rotation_from_vector
 
 MERGE_SLACK = 0.004
-"""Pieces are merged into one box that stands out from their hull by at most this [m]."""
+"""Pieces are merged into one box if the box stands out from their hull by at most this [m]."""
 
 SLENDERNESS = 1.3
-"""Length of a chain's slabs over the body's width: fewer, larger spheres for larger values."""
+"""Length of a chain's slabs over the body's width. Larger values give fewer and larger spheres."""
 
 
 OVERLAP_POSTURES = 200
-"""Random postures in which chains of spheres are tried."""
+"""Number of random postures in which chains of spheres are tested for overlap."""
 
 OFTEN = 0.5
-"""Share of those postures from which on a pair gets the finer bound."""
+"""A pair gets the finer bound if its chains overlap in at least this share of the postures."""
 
 
 def _directions() -> Array:
@@ -56,8 +56,8 @@ _DIRECTIONS = _directions()
 def slab_cover(body: CollisionBody) -> tuple[Piece, ...]:
     """Cover a body by boxes, cylinders, spheres and capsules.
 
-    Simple shapes stand for themselves; a hull gets its smallest box among a few orientations.
-    Pieces inside another are dropped, and pieces that fill a common box nearly are merged.
+    A simple shape is its own cover. A hull gets its smallest box among a few orientations. Pieces
+    inside another piece are dropped, and pieces that nearly fill a common box are merged.
     """
     return _slab_cover(CacheKey(body.pieces, body.name))
 
@@ -87,7 +87,7 @@ def _chain_cover(seen: CacheKey) -> SphereChain:
 
 
 def close_pairs(geometry: CellGeometry) -> frozenset[tuple[int, int]]:
-    """Return the pairs within an arm whose chains of spheres overlap in many postures."""
+    """Return the pairs of one arm whose chains of spheres overlap in many postures."""
     bodies, found = geometry.bodies, []
     # Where an arm stands does not matter.
     known = [b.content if b.root is None else digest_of_parts(b.root[1]) for b in bodies]
@@ -120,8 +120,8 @@ def _often_close(seen: CacheKey) -> bool:
 
 @lru_cache(maxsize=4)
 def _steps(seen: CacheKey) -> list[Array]:
-    """Compute, per joint of an arm, its frame in the one before it (POSTURES, 4, 4) at random
-    postures."""
+    """Compute for each joint of an arm its frame in the frame of the joint before it (POSTURES, 4,
+    4), at random postures."""
     (arm,), found = seen.given, []
     q = np.random.default_rng(0).uniform(arm.lower, arm.upper, (OVERLAP_POSTURES, arm.joints))
     for k, axis in enumerate(arm.axes):
@@ -136,8 +136,8 @@ def _steps(seen: CacheKey) -> list[Array]:
 
 
 def _apart(first: tuple[Piece, ...], second: tuple[Piece, ...], T: Array) -> NDArray[np.bool_]:
-    """Return (n,) True where a coordinate axis separates two sets of pieces, the second seen from
-    the first by T (n, 4, 4)."""
+    """Return (n,) True for poses in which a coordinate axis separates two sets of pieces. T (n, 4,
+    4) maps the second set into the frame of the first."""
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     high = np.max([support(piece, axes) for piece in first], axis=0)
     turned = (-axes @ T[:, :3, :3]).reshape(-1, 3)
@@ -147,7 +147,7 @@ def _apart(first: tuple[Piece, ...], second: tuple[Piece, ...], T: Array) -> NDA
 
 
 def _covered(piece: Piece, cover: list[Piece]) -> bool:
-    """Return True if a piece is its own cover, or lies in one box of the cover (exact)."""
+    """Return True if a piece is in its own cover, or lies inside one box of the cover (exact)."""
     return any(
         other is piece or (isinstance(other.shape, Box) and contains(other, piece))
         for other in cover
@@ -194,7 +194,8 @@ def _outermost(cover: list[Piece]) -> list[Piece]:
 
 
 def _merge_once(cover: list[Piece]) -> list[Piece] | None:
-    """Merge the pair whose common box adds the least volume, if that is within the slack."""
+    """Merge the two pieces whose common box adds the least volume; None if no pair stays within the
+    slack."""
     best: tuple[float, int, int, Piece] | None = None
     for i, j in combinations(range(len(cover)), 2):
         pair = (cover[i], cover[j])

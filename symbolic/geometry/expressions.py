@@ -1,8 +1,8 @@
-"""One-sided operations for bounds of distances, exact or smooth, and placements.
+"""Operations that err to one side, exact or smooth, for bounds of distances; and placements.
 
-A lower bound of a distance stays one if every operation that it is made of errs downwards (or
-upwards where it is subtracted). `EXACT` computes the sharpest bound, with kinks; `Smooth(width)`
-replaces each kink by a hyperbola of that width, twice (in fact infinitely often) differentiable:
+A lower bound of a distance remains one if every operation in it errs downwards (or upwards where it
+is subtracted). `EXACT` computes the sharpest bound, with kinks. `Softness(width)` replaces each
+kink by a hyperbola of this width, which has derivatives of every order:
 
   |x|  <=  sqrt(x^2 + w^2)              exceeds |x| by at most w,
   max(a, b)  >=  (a + b + sqrt((a-b)^2 + w^2) - w) / 2    falls short by at most w / 2,
@@ -24,19 +24,20 @@ from symbolic.array import Array
 from symbolic.expression import number
 
 _TINY = 1e-12
-"""Added under roots so that derivatives stay finite."""
+"""Added under roots, so that derivatives stay finite."""
 
 
 @dataclass(frozen=True)
 class Softness:
     """Operations that err to one side; width 0 means exact.
 
-    `above` results are at least the true value, `below` results at most.
+    Methods with `above` in their name return at least the true value, those with `below` at most
+    the true value.
 
     Attributes:
-        width: of the kinks [m].
-        turn: of those of the entries of rotations [1], whose effect is a body's size longer; None
-            for the same number as `width`.
+        width: width of the kinks of lengths [m].
+        turn: width of the kinks of entries of rotations [1], whose effect is multiplied by the size
+            of a body; None for the same number as `width`.
     """
 
     width: float = 0.0
@@ -108,15 +109,16 @@ class BasePose(Protocol):
 
     @property
     def rotation(self) -> Any:
-        """(3, 3)."""
+        """Rotation (3, 3) of the base in the world."""
 
     @property
     def position(self) -> Any:
-        """(3,) [m]."""
+        """Position (3,) of the base in the world [m]."""
 
 
 def world_placements(base: BasePose, placements: tuple[ca.SX, ca.SX]) -> list[tuple[ca.SX, ca.SX]]:
-    """Compute the rotation and position in the world of each joint frame given in the root."""
+    """Compute the rotation and position in the world of each joint frame, from placements in the
+    root."""
     rotations, positions = placements
     R, p = ca.SX(number(base.rotation)), ca.SX(number(base.position))
     return [
@@ -135,8 +137,8 @@ def clean(matrix: Array) -> Array:
 def quaternion(R: ca.SX) -> ca.SX:
     """Compute the unit quaternion (4,), w x y z, of a rotation (3, 3), stable for every angle.
 
-    Each column below is the quaternion times one of its own components (times 4); the column of
-    the largest component is the accurate one (Shepperd 1978).
+    Each column of the matrix is 4 times the quaternion times one of its components. The column of
+    the largest component is the most accurate (Shepperd 1978).
     """
     trace = ca.trace(R)
     x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]

@@ -1,8 +1,8 @@
 """Numbers behind the bounds of distances and motions: covers, obstacles, reach.
 
-NumPy computes it once per cell. `symbolic.geometry.clearance` writes expressions of it, with arrays
-or symbols as values (`symbolic.parameters.CellParameters`). The choice of a pair's bound depends on
-numbers, too, and is stored as flags.
+NumPy computes them once per cell. `symbolic.geometry.clearance` builds expressions of them, with
+arrays or symbols as values (`symbolic.parameters.CellParameters`). The choice of a pair's bound
+depends on these numbers too, and is stored as flags.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ from symbolic.records.numbered import ParameterGroup
 from symbolic.records.poses import axes_with_z
 
 SLANTED_LENGTH = 0.25
-"""Bodies longer than wide by more than this [m] are also compared along their own axes: across
-the world's axes, a slanted body seems wider by up to that much."""
+"""Bodies that are longer than wide by more than this [m] are also compared along their own axes.
+Along the world's axes a slanted body seems wider by up to this much."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,12 @@ class CoverSolid:
 
 @dataclass(frozen=True)
 class ScreenChain:
-    """Equal spheres. centres: (n, 3) in a frame [m]. radius: (1,) of each [m]."""
+    """A chain of equal spheres.
+
+    Attributes:
+        centres: (n, 3) in a frame [m].
+        radius: (1,) radius of each sphere [m].
+    """
 
     centres: Array
     radius: Array
@@ -68,13 +73,14 @@ class ScreenChain:
 
 @dataclass(frozen=True)
 class Reach:
-    """Geometry of a body's motion with its frame.
+    """Distances that bound how a body moves with its frame.
 
     Attributes:
-        centre: (3,) of its bounding box [m].
-        spans: (2,) farthest of its points from there, and from the frame's origin [m].
-        joints: per joint before it the distance from that one's axis that no point exceeds [m]; 1
-            of a joint that slides.
+        centre: (3,) centre of the body's bounding box [m].
+        spans: (2,) largest distance of the body's points from this centre, and from the frame's
+            origin [m].
+        joints: for each joint before the body the largest distance of its points from the joint's
+            axis [m]; 1 for a sliding joint.
     """
 
     centre: Array
@@ -87,11 +93,12 @@ class Obstacle:
     """A fixed convex piece.
 
     Attributes:
-        kind: of its shape.
-        axes: (3, 3) directions in which a box is compared, as rows; None for the world's.
-        extent: (2, 3) least and largest coordinate along these [m].
-        cover: a simple shape that contains it.
-        to_own: (3, 3) from the world to its own axes, None where these are the world's.
+        kind: kind of the shape.
+        axes: (3, 3) directions along which a box is compared, as rows; None for the world's axes.
+        extent: (2, 3) least and largest coordinate along these directions [m].
+        cover: a simple shape that contains the piece.
+        to_own: (3, 3) rotation from the world to the piece's own axes; None if these are the
+            world's axes.
         offset: position (3,) of the world's origin in the piece's own axes [m].
     """
 
@@ -105,22 +112,25 @@ class Obstacle:
 
 @dataclass(frozen=True)
 class ScreenBody(ContentRecord):
-    """A body.
+    """The numbers of one body for bounds of distances and motions.
 
     Attributes:
-        group: see `CollisionBody`.
-        frame: the frame that it is fixed to; 'world' with a robot for bodies at that robot's base.
-        cover: simple shapes that contain it, in that frame or in that of its base; () of an
+        group: group of the `CollisionBody`.
+        frame: frame to which the body is fixed; 'world' with a robot's index for bodies at the
+            robot's base.
+        cover: simple shapes that contain the body, in this frame or in the frame of the base; ()
+            for an obstacle.
+        chain: chain of spheres that contains the body, in this frame or in the world; None for an
             obstacle.
-        chain: likewise in that frame, or in the world; None of an obstacle.
-        extent: (2 n + 2, 3) of bodies at a base: least and largest coordinates in the world of
-            all, then of each of n simple shapes [m].
-        reach: None of what stands.
-        pieces: of each the pose in its frame: rotation (3, 3), None for the frame's, and centre
-            (3,) [m]; of what stands the quaternion (4,) in the world and the centre.
-        obstacles: its pieces, of what stands in the environment.
-        slanted: whether its own axes matter to obstacles.
-        is_constant: whether it is a link, or a mesh that moves: its numbers follow from files.
+        extent: (2 n + 2, 3) for a body at a base: least and largest coordinates in the world of the
+            whole body, then of each of n simple shapes [m].
+        reach: distances that bound the body's motion; None if the body does not move.
+        pieces: pose of each piece in the frame: rotation (3, 3), None for the identity, and centre
+            (3,) [m]; for a body that does not move the quaternion (4,) in the world and the centre.
+        obstacles: pieces of a fixed body of the environment.
+        slanted: whether obstacles are also compared along the body's own axes.
+        is_constant: whether the numbers follow from files alone: the body is a link, or a mesh that
+            moves.
     """
 
     group: str
@@ -137,7 +147,12 @@ class ScreenBody(ContentRecord):
 
 @dataclass(frozen=True)
 class ScreenBase:
-    """Pose of an arm's base in the world. rotation: (3, 3); position: (3,) [m]."""
+    """Pose of an arm's base in the world.
+
+    Attributes:
+        rotation: (3, 3).
+        position: (3,) [m].
+    """
 
     rotation: Any
     position: Any
@@ -145,19 +160,19 @@ class ScreenBase:
 
 @dataclass(frozen=True)
 class Screen:
-    """A cell's bodies and pairs.
+    """The numbers of a cell's bodies and pairs for bounds of distances and motions.
 
     Attributes:
         bases: pose of each arm's base.
         turning: for each arm, True for each joint that turns, False for one that slides.
         bodies: all bodies, in the geometry's order.
-        pairs: possible pairs, as indices of bodies.
-        own: per pair within an arm whether its bound is the finer one, else None.
-        payload: the payload's box.
-        payload_is_mesh: whether that follows from a file.
-        between: (3, 3) directions as rows of which the first points from one base to the other;
-            None where the world's do.
-        given: the group of its numbers where these are symbols.
+        pairs: indices of both bodies of each possible pair.
+        own: for each pair of one arm whether it gets the finer bound; None for other pairs.
+        payload: bounding box of the payload.
+        payload_is_mesh: whether this box follows from a file.
+        between: (3, 3) directions as rows, the first from one base to the other; None if the
+            world's axes are used.
+        given: the numbers as one group if they are symbols.
     """
 
     bases: tuple[ScreenBase, ScreenBase]
@@ -200,7 +215,7 @@ def has_hulls(body: CollisionBody) -> bool:
 
 
 def _seen(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> CacheKey:
-    """Return the key of a body and of the parts of both arms that its bounds depend on."""
+    """Return the cache key of a body and of the parts of both arms on which its bounds depend."""
     of: tuple[Any, ...] = (body.content,)
     if body.frame.kind == "link":
         of = (body.content, arms[body.frame.robot].chain)
@@ -305,11 +320,11 @@ def _reach(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> Reach:
 
 
 def reach_about_joints(body: CollisionBody, arm: ArmGeometry) -> Array:
-    """Bound the distances (n,) of a link's body from each joint's axis [m]; 1 for a prismatic
-    joint.
+    """Compute upper bounds (n,) of the distances of a link's body from each joint's axis [m]; 1 for
+    a prismatic joint.
 
-    Joints behind the body do not move it: zero. Own joint: from the shape; joints further down:
-    with the chain between stretched.
+    The bound is zero for joints behind the body, which do not move it. For the body's own joint it
+    follows from the shape. For earlier joints the chain of links between is taken as stretched.
     """
     reach = np.zeros(arm.joints)
     last = body.frame.joint
@@ -327,7 +342,7 @@ def reach_about_joints(body: CollisionBody, arm: ArmGeometry) -> Array:
 
 
 def _slanted_matters(body: CollisionBody) -> bool:
-    """Return True if a body is the payload, or long."""
+    """Return True if a body is the payload, or is markedly longer than wide."""
     _, width, length = edges(body.pieces)
     return body.frame.kind == "box" or bool(length - width > SLANTED_LENGTH)
 
@@ -349,6 +364,6 @@ def turned(rotation: Any) -> ca.SX:
 
 
 def columns(values: Any) -> Sequence[ca.SX]:
-    """Return the rows (n, 3) of an array as columns."""
+    """Return the rows (n, 3) of an array as a sequence of column vectors (3,)."""
     whole = ca.SX(number(values))
     return [whole[k, :].T for k in range(whole.shape[0])]

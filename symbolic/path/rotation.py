@@ -1,11 +1,11 @@
-"""Orientation of the box from the last three numbers of its pose, and its rates.
+"""Orientation of the box from the last three numbers of its pose, and the rates of the orientation.
 
-What the numbers are the cell's chart says (`symbolic.records.poses`): roll, pitch, yaw with
-R = Rz(yaw) Ry(pitch) Rx(roll) (paper Eqs. 27-28), or a rotation vector v with
-R = exp(v) R_reference, by its unit quaternion q: angular velocity and acceleration are the vector
-parts of 2 q' q* and 2 q'' q* (Kuipers, Quaternions and Rotation Sequences, 1999). Both are in the
-world frame. q is an entire function of v, written as a power series of |v|^2: no case distinction
-at zero, and derivatives of any order exact to rounding.
+The convention of these numbers is `symbolic.records.poses.Orientation`: roll, pitch, yaw with R =
+Rz(yaw) Ry(pitch) Rx(roll) (paper Eqs. 27-28), or a rotation vector v with R = exp(v) R_reference.
+For the vector, angular velocity and acceleration are the vector parts of 2 q' q* and 2 q'' q* with
+its unit quaternion q (Kuipers, Quaternions and Rotation Sequences, 1999). Both are in the world
+frame. q is an entire function of v, written as a power series of |v|^2: there is no case
+distinction at zero, and derivatives of any order are exact up to rounding.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from symbolic.expression import Expression
 from symbolic.records.poses import Orientation
 
 TERMS = 16
-"""Terms of the power series; the rest is below 1e-17 up to one turn, 1e-13 up to 1.5 turns."""
+"""Number of terms of the power series. The rest is below 1e-17 up to one turn, and below 1e-13 up
+to 1.5 turns."""
 
 _COSINE = [(-0.25) ** n / factorial(2 * n) for n in range(TERMS)]
 _SINE = [0.5 * (-0.25) ** n / factorial(2 * n + 1) for n in range(TERMS)]
@@ -34,8 +35,8 @@ def rotation_matrix(orientation: Orientation, numbers: Expression) -> Expression
 
 
 def angular_velocity(orientation: Orientation, numbers: Expression, rate: Expression) -> Expression:
-    """Compute the angular velocity (3,) in the world frame from the numbers and their rate
-    [rad/s]."""
+    """Compute the angular velocity (3,) in the world frame [rad/s] from the three numbers of the
+    orientation and their rate."""
     if orientation.is_vector:
         zero = type(rate).zeros(3)
         return _turned(*_quaternion(numbers), *_quaternion_rates(numbers, rate, zero)[0])
@@ -45,15 +46,15 @@ def angular_velocity(orientation: Orientation, numbers: Expression, rate: Expres
 def angular_acceleration(
     orientation: Orientation, numbers: Expression, rate: Expression, second: Expression
 ) -> Expression:
-    """Compute the angular acceleration (3,) in the world frame from the numbers, their rate and
-    second rate."""
+    """Compute the angular acceleration (3,) in the world frame [rad/s^2] from the three numbers of
+    the orientation and their first and second rate."""
     if orientation.is_vector:
         return _turned(*_quaternion(numbers), *_quaternion_rates(numbers, rate, second)[1])
     return _rpy_acceleration(numbers, rate, second)
 
 
 Quaternion = tuple[Expression, Expression]
-"""Real part, and vector part (3,)."""
+"""A quaternion: real part, and vector part (3,)."""
 
 
 def _quaternion(v: Expression) -> Quaternion:
@@ -79,8 +80,8 @@ def _quaternion_rates(
 def _derivatives(
     series: Sequence[float], square: Expression, moved: Expression, pushed: Expression
 ) -> Quaternion:
-    """Compute the first and second time derivative of a power series in `square`, given those of
-    `square`."""
+    """Compute the first and second time derivative of a power series in `square`, from the first
+    and second time derivative of `square`."""
     first = [n * c for n, c in enumerate(series)][1:]
     slope = _series(first, square)
     bend = _series([n * c for n, c in enumerate(first)][1:], square)
@@ -95,7 +96,7 @@ def _series(coefficients: Sequence[float], x: Expression) -> Expression:
 
 
 def _turned(w: Expression, u: Expression, w_rate: Expression, u_rate: Expression) -> Expression:
-    """Compute the vector part (3,) of 2 q' q*, q = (w, u)."""
+    """Compute the vector part (3,) of 2 q' q* of a quaternion q = (w, u)."""
     return 2.0 * (w * u_rate - w_rate * u + ca.cross(u, u_rate))
 
 
@@ -117,8 +118,8 @@ def _rpy_matrix(rpy: Expression) -> Expression:
 
 
 def rate_matrix(rpy: Expression) -> Expression:
-    """Compute E (3, 3) with angular velocity = E(rpy) @ rpy_rate, world frame, of roll, pitch,
-    yaw."""
+    """Compute the matrix E (3, 3) of roll, pitch, yaw with angular velocity = E(rpy) @ rpy_rate in
+    the world frame."""
     cp, sp = ca.cos(rpy[1]), ca.sin(rpy[1])
     cy, sy = ca.cos(rpy[2]), ca.sin(rpy[2])
     return ca.vertcat(

@@ -29,8 +29,9 @@ class PathBasis:
 
     Attributes:
         parameter: (n,) path parameter u of every sample.
-        position: (n, n_waypoints), value of the spline.
-        first, second: (n, n_waypoints), first and second derivative of the spline by u.
+        position: (n, n_waypoints) matrix to the values of the spline.
+        first, second: (n, n_waypoints) matrices to the first and second derivatives of the spline
+            by u.
     """
 
     parameter: Array
@@ -86,7 +87,8 @@ def sample_basis(task: Task) -> PathBasis:
 
 Handed = Mapping[str, ca.MX]
 NONE: Handed = MappingProxyType({})
-"""A cell's numbers as inputs of a function of MX (`symbolic.expression.mx_parameters`)."""
+"""Empty mapping: the cell's numbers are constants, not inputs
+(`symbolic.expression.mx_parameters`)."""
 
 
 def _fixed(task: Task, value: Any, x: Expression, handed: Handed) -> Expression:

@@ -24,13 +24,14 @@ from symbolic.path.spline import NONE, Handed, PathBasis
 from symbolic.records import Task
 
 LENGTH_FLOOR = 1e-10
-"""Added in squares below the root of lengths [m]: keeps derivatives of a zero step finite."""
+"""Added in squares below the root of lengths [m], to keep derivatives of a zero step finite."""
 
 STEP_TIME_FLOOR = 1e-6
 """Least duration of a step [s]: a step without motion still advances the clock."""
 
 RAMP_NEWTON_STEPS = 8
-"""Newton steps that invert the ramp; it is convex and started on its safe side."""
+"""Number of Newton steps that invert the ramp. The ramp is convex, and the steps start on the side
+from which they converge."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,7 @@ def driven_path(
 def _along(
     time: ca.MX, path: tuple[ca.MX, ca.MX, ca.MX], speed: ca.MX, acceleration: ca.MX
 ) -> TimedPath:
-    """Compute the timed path from the pose's derivatives by u, and u' and u''."""
+    """Compute the timed path from the pose and its derivatives by u, and from u' and u''."""
     (pose, first, second), rows = path, ca.repmat(1.0, 6, 1)
     pushed = second * ca.mtimes(rows, speed**2) + first * ca.mtimes(rows, acceleration)
     return TimedPath(time, pose, first * ca.mtimes(rows, speed), pushed)
@@ -112,8 +113,8 @@ def _constant(task: Task, pose: ca.MX, rounding: ca.MX | None, handed: Handed) -
 
 
 def _step_time_function(task: Task, is_rounded: bool) -> ca.Function:
-    """Build the function of the duration of a step between two poses (paper Eqs. 23-24), with its
-    kink rounded by a share if `is_rounded`."""
+    """Build the function of the duration of a step between two poses (paper Eqs. 23-24). With
+    `is_rounded` the kink between translation and rotation is rounded by a relative width."""
     start, end, given = ca.SX.sym("start", 6), ca.SX.sym("end", 6), sx_parameters(task).values()
     step = end - start
     length = _smooth_norm(step[:3])
@@ -174,8 +175,8 @@ def _ramped(
 
 
 def _length_rate_function(task: Task) -> ca.Function:
-    """Build the function of arc length per unit of u and its derivative; rotation counts at the
-    reference speeds."""
+    """Build the function of the arc length per unit of u and its derivative by u. Rotation counts
+    as length by the ratio of the reference speeds."""
     pose, first, second = (ca.SX.sym(name, 6) for name in ("pose", "first", "second"))
     lever = task.reference_speed / task.reference_angular_speed
     turn = angular_velocity(task.orientation, pose[3:], first[3:])
@@ -190,8 +191,8 @@ def _length_rate_function(task: Task) -> ca.Function:
 
 
 def _ramp_function(task: Task) -> ca.Function:
-    """Build the function of time, speed and acceleration at an arc length of a smooth rest-to-rest
-    motion."""
+    """Build the function of time, speed and acceleration at an arc length, for a smooth
+    rest-to-rest motion."""
     arc, total = ca.SX.sym("arc"), ca.SX.sym("total")
     ramp = task.ramp_time
     cruise = ca.fmin(task.reference_speed, total / ramp)

@@ -1,8 +1,8 @@
 """The cell: shapes, robots, payload, contacts, uncertainty, handling, and its digest.
 
-A workcell that is as it was read has the digest of its files. One that was changed in memory
-(`dataclasses.replace`) has one of its own, made from that and from its values, so that nothing that
-is kept under a digest belongs to another cell.
+An unchanged workcell has the digest of its files. A workcell changed in memory
+(`dataclasses.replace`) has a digest of its own, made from that digest and from its values. So
+nothing that is cached under a digest belongs to another cell.
 """
 
 from __future__ import annotations
@@ -31,14 +31,23 @@ def _zeros() -> Array:
 
 @dataclass(frozen=True)
 class Box:
-    """A cuboid centred at its frame. size: (3,) full edge lengths [m]."""
+    """A cuboid centred at its frame.
+
+    Attributes:
+        size: (3,) full edge lengths [m].
+    """
 
     size: Annotated[Vector, quantity.SHAPE_SIZE]
 
 
 @dataclass(frozen=True)
 class Cylinder:
-    """A cylinder centred at its frame, axis along z. radius, length [m]."""
+    """A cylinder centred at its frame, with its axis along z.
+
+    Attributes:
+        radius: radius [m].
+        length: length along z [m].
+    """
 
     radius: Annotated[float, quantity.SHAPE_SIZE]
     length: Annotated[float, quantity.SHAPE_SIZE]
@@ -46,7 +55,11 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Sphere:
-    """A sphere centred at its frame. radius [m]."""
+    """A sphere centred at its frame.
+
+    Attributes:
+        radius: radius [m].
+    """
 
     radius: Annotated[float, quantity.SHAPE_SIZE]
 
@@ -56,7 +69,12 @@ Scale = Annotated[Vector, quantity.SCALE, BroadcastScalar()]
 
 @dataclass(frozen=True)
 class Mesh:
-    """A triangle mesh file (STL, OBJ, PLY or OFF). scale: (3,) factor per axis."""
+    """A triangle mesh file (STL, OBJ, PLY or OFF).
+
+    Attributes:
+        path: the file.
+        scale: (3,) factor per axis.
+    """
 
     path: Path
     scale: Scale = field(default_factory=lambda: read_only(np.ones(3)))
@@ -70,10 +88,10 @@ class Body:
     """A named collision shape.
 
     Attributes:
-        name: unique within its owner.
-        shape: its geometry.
-        pose: (4, 4), the shape's frame in its parent frame (world for the environment,
-            flange for a tool).
+        name: name of the body, unique within the cell or the robot.
+        shape: geometry of the body.
+        pose: (4, 4) frame of the shape in its parent frame (world for the environment, flange for a
+            tool).
     """
 
     name: str
@@ -83,9 +101,11 @@ class Body:
 
 @dataclass(frozen=True)
 class Capsule:
-    """A segment along z, centred at its frame, thickened by a radius.
+    """A line segment along z, centred at its frame and thickened by a radius.
 
-    radius [m]; length between the centres of the end spheres [m].
+    Attributes:
+        radius: radius [m].
+        length: distance between the centres of the end spheres [m].
     """
 
     radius: Annotated[float, quantity.SHAPE_SIZE]
@@ -113,33 +133,34 @@ class ToolLoad:
 ADDRESS = text_pattern(
     r"[A-Za-z0-9](?:[A-Za-z0-9.:-]{0,251}[A-Za-z0-9])?", "a host name or an IP address"
 )
-"""Host names, IPv4 and IPv6 addresses; nothing that ends a string of a robot's language."""
+"""Host names, IPv4 and IPv6 addresses, without characters that could end a string in a robot's
+language."""
 
 PREFIX = text_pattern(r"(?:[A-Za-z][A-Za-z0-9_]{0,39})?", "letters, digits, _, with a letter first")
-"""What names of joints may begin with in ROS; '' for nothing."""
+"""Prefixes of joint names in ROS; '' for none."""
 
 SIGNAL = text_pattern(
     r"(?:/?[A-Za-z0-9][A-Za-z0-9_/]{0,79})?",
     "the number of a digital line, a signal's name, or a name of ROS that begins with /",
 )
-"""What the outputs and inputs of hands are called; '' for none."""
+"""Names of the outputs and inputs of hands; '' for none."""
 
 
 @dataclass(frozen=True)
 class Driver:
-    """Connection to an arm's controller, and its abilities.
+    """Connection to an arm's controller, and the abilities of the controller.
 
     Attributes:
         address: host name or IP address; '' if unknown.
         prefix: prefix of the arm's joint names in its driver; None for the robot's name.
-        rate: of the driver's cycle [Hz]; None for the target's default.
+        rate: cycle rate of the driver [Hz]; None for the target's default.
         lag: delay of the arm behind its command [s].
-        force_control: the controller has its maker's optional force control: a sensor at the
-            flange, and instructions that press with a force.
-        stiffness: of the arm under its controller, at the pad along its normal [N/m]; None if not
-            measured.
-        grip_output: output that switches the hands of the arm; '' for none.
-        grip_input: input that is on while they hold; '' for none.
+        force_control: True if the controller has its maker's optional force control: a sensor at
+            the flange, and instructions that press with a force.
+        stiffness: stiffness of the controlled arm at the pad, along the pad's normal [N/m]; None if
+            not measured.
+        grip_output: name of the output that switches the hands of the arm; '' for none.
+        grip_input: name of the input that is on while the hands hold; '' for none.
     """
 
     address: Annotated[str, ADDRESS] = ""
@@ -157,31 +178,32 @@ class Robot:
     """One arm: its model file, base, tool and limits.
 
     Attributes:
-        name: unique in the workcell.
+        name: name of the robot, unique in the workcell.
         urdf: the model file, a URDF or a xacro file.
-        package_dirs: folders that `package://` addresses of the URDF are looked up in: those of
-            the workcell file, then those of ROS and of the Python environment that it needs.
-        flange: name of the URDF frame that the tool is mounted on.
+        package_dirs: folders in which `package://` addresses of the URDF are looked up: folders of
+            the workcell file, then needed folders of ROS and of the Python environment.
+        flange: name of the URDF frame on which the tool is mounted.
         locked_joints: joints of the URDF held at a fixed position [rad or m].
-        T_world_base: (4, 4), the URDF's root in the world.
-        T_flange_pad: (4, 4), the pad frame on the flange.
+        T_world_base: (4, 4) root of the URDF in the world.
+        T_flange_pad: (4, 4) pad frame in the flange frame.
         tool: collision bodies of the tool, in the flange frame.
-        position_lower, position_upper: (n,) joint limits [rad, or m where a joint slides].
+        position_lower, position_upper: (n,) joint limits [rad, or m for a sliding joint].
         velocity_max: (n,) [rad/s].
         acceleration_max: (n,) [rad/s^2].
-        torque_max: (n,) [N m, or N]; infinite where it is unknown.
+        torque_max: (n,) [N m, or N for a sliding joint]; infinite if unknown.
         min_manipulability: least allowed |det J| of the flange-pad Jacobian of the six joints that
             follow the box [m^3].
         xacro_arguments: names and values of the xacro file's arguments.
-        srdf: file whose disabled pairs of links are not checked for collision.
-        chain_root: link of the URDF that the arm begins at, the flange being its other end; ''
-            if every joint that is not locked belongs to the arm.
-        drop_links: names or patterns of links that are left out, with all links behind them.
+        srdf: SRDF file; pairs of links that it disables are not checked for collision.
+        chain_root: link of the URDF at which the arm begins; it ends at the flange. '' if every
+            joint that is not locked belongs to the arm.
+        drop_links: names or patterns of links that are left out together with all links behind
+            them.
         tool_load: mass and inertia of the tool; None if unknown.
         redundant_joints: names of the joints beyond six, whose paths are part of the decision
             vector; () for an arm with six joints.
-        jerk_max: (n,) [rad/s^3], or None without limits.
-        driver: of its controller, for bundles.
+        jerk_max: (n,) [rad/s^3]; None for no limits.
+        driver: connection to the arm's controller, for bundles.
     """
 
     name: Label
@@ -216,15 +238,16 @@ class Payload:
     """The payload, called the box.
 
     Attributes:
-        size: (3,) edge lengths along the box axes [m]; of another shape those of a box about the
-            frame that holds it.
+        size: (3,) edge lengths along the box axes [m]; for another shape those of a box, centred at
+            the frame, that contains it.
         mass: [kg].
         centre_of_mass: (3,) in the box frame [m].
         inertia: (3, 3) about the centre of mass, box axes [kg m^2].
         velocity_max, acceleration_max: limits of the box's translation [m/s, m/s^2].
-        angular_velocity_max, angular_acceleration_max: of its rotation [rad/s, rad/s^2].
-        jerk_max: of its translation [m/s^3], or None without a limit.
-        shape: its geometry in the box frame; None for a box of its size.
+        angular_velocity_max, angular_acceleration_max: limits of the box's rotation [rad/s,
+            rad/s^2].
+        jerk_max: limit of the box's translation [m/s^3]; None for no limit.
+        shape: geometry in the box frame; None for a box of edge lengths `size`.
     """
 
     size: Array
@@ -240,12 +263,13 @@ class Payload:
 
     @property
     def solid(self) -> Box | Cylinder | Mesh:
-        """Its geometry in the box frame, a box of `size` by default."""
+        """Geometry of the payload in the box frame; by default a box with edge lengths `size`."""
         return Box(self.size) if self.shape is None else self.shape
 
 
 HandKind = Literal["pad", "cup", "magnet", "fingers"]
-"""A pad holds because both arms squeeze the payload; a hand of another kind holds by itself."""
+"""A pad holds because both arms squeeze the payload. A hand of another kind holds by its own
+force."""
 
 
 @dataclass(frozen=True)
@@ -253,17 +277,19 @@ class Contact:
     """The frictional contact between one robot's pad and the box.
 
     Attributes:
-        T_box_pad: (4, 4), the pad frame in the box frame; its z axis is the contact normal, which
-            points into the box.
+        T_box_pad: (4, 4) pad frame in the box frame. Its z axis is the contact normal, which points
+            into the box.
         friction: Coulomb coefficient.
         patch_radius: radius of a round contact patch, half the diagonal of a rectangular one [m].
         half_sides: half the sides of a rectangular patch along the pad's x and y axes [m]; None
             for a round one.
-        further: other pads of the same robot, rigidly beside the first, as on a fork, in an array
-            of cups or in a gripper; with its friction, patch, kind and holding force.
-        kind: of the hand. A cup presses along its lip, a ring; the others all over their patch.
-        holding_force: with which a hand holds by itself: vacuum times area, a magnet's pull, the
-            closing force of a gripper [N]; zero for a pad.
+        further: other pads of the same robot, rigidly mounted beside the first, as on a fork, in an
+            array of cups or in a gripper. They have the first pad's friction, patch, kind and
+            holding force.
+        kind: kind of the hand. A cup presses along its ring-shaped lip, the others over their whole
+            patch.
+        holding_force: own holding force of a hand: vacuum times area, pull of a magnet, closing
+            force of a gripper [N]; zero for a pad.
     """
 
     T_box_pad: Array
@@ -276,7 +302,7 @@ class Contact:
 
     @property
     def is_ring(self) -> bool:
-        """True if the patch presses along its rim alone."""
+        """True if the patch presses only along its rim."""
         return self.kind == "cup"
 
     @property
@@ -292,21 +318,22 @@ class Uncertainty:
     """Largest deviation of each quantity from its nominal value while the robots hold the box.
 
     Attributes:
-        friction: share by which either coefficient may be lower or higher.
+        friction: share by which either friction coefficient may be lower or higher.
         mass: share by which the mass may be lower or higher.
-        centre_of_mass: (3,) half the width of its range along the box axes [m].
-        pad_position: how far either pad may be displaced in its contact plane [m].
-        disturbance: (3,) largest acceleration of the box beside the motion's, along the world's
-            axes, either way [m/s^2].
+        centre_of_mass: (3,) half the width of its range, along the box axes [m].
+        pad_position: distance by which either pad may be displaced in its contact plane [m].
+        disturbance: (3,) largest additional acceleration of the box, along the world's axes, in
+            either direction [m/s^2].
         tracking: share of the commanded normal force that may be missing.
-        internal_force: opposed tangential force by which either arm may work against the other
-            [N].
-        tilt: of either pad against its face [rad].
-        relative_position: error of the pads' places relative to one another, along their faces [m].
-        relative_angle: likewise of their directions [rad].
-        stiffness: of either arm along its pad [N/m]: it makes a force of `relative_position`. Zero
-            where it is not known: pads are displaced by it then.
-        stated: whether the cell states the set; else it is the usual one.
+        internal_force: tangential force with which the arms may push against each other [N].
+        tilt: angle of either pad against its face [rad].
+        relative_position: error of the pads' positions relative to each other, along their faces
+            [m].
+        relative_angle: error of the pads' directions relative to each other [rad].
+        stiffness: tangential stiffness of either arm at its pad [N/m], which turns
+            `relative_position` into a force. Zero if unknown; `relative_position` then displaces
+            the pads.
+        stated: True if the cell states the uncertainty, False for the usual one.
     """
 
     friction: Annotated[float, quantity.SHARE] = 0.0
@@ -324,22 +351,23 @@ class Uncertainty:
 
     @property
     def is_empty(self) -> bool:
-        """True if no quantity deviates."""
+        """True if every range is zero."""
         return not any(np.any(getattr(self, name)) for name in RANGES)
 
     @property
     def title(self) -> str:
-        """Name of the set in messages."""
+        """Name of the uncertainty in messages: stated or usual."""
         return "the cell's [uncertainty]" if self.stated else "the usual uncertainty"
 
     @property
     def opposed_force(self) -> float:
-        """Tangential force of either arm against the other [N]: both arms are springs in series."""
+        """Tangential force with which the arms push against each other [N]. Both arms are springs
+        in series."""
         return self.internal_force + self.stiffness * self.relative_position / 2.0
 
     @property
     def apart(self) -> float:
-        """Largest displacement of the pads along their faces relative to each other [m]."""
+        """Largest displacement of the pads relative to each other along their faces [m]."""
         return 0.0 if self.stiffness else self.relative_position
 
     @property
@@ -348,15 +376,15 @@ class Uncertainty:
         return self.tilt + self.relative_angle
 
     def scaled(self, factor: float) -> Uncertainty:
-        """Return the set with every range times a factor."""
+        """Return the uncertainty with every range multiplied by a factor."""
         return replace(self, **{name: factor * getattr(self, name) for name in RANGES})
 
     def changed(self, by: float | Mapping[str, float]) -> Uncertainty:
-        """Return the set with every range times a factor, or with some ranges replaced; one number
-        stands for all three axes.
+        """Return the uncertainty with every range multiplied by a factor, or with some ranges
+        replaced by name. One number stands for all three axes.
 
         Raises:
-            SettingsError: there is no range of a name.
+            SettingsError: a name is not the name of a range.
         """
         if not isinstance(by, Mapping):
             return self.scaled(by)
@@ -372,7 +400,7 @@ class Uncertainty:
         return replace(self, **ranges)
 
     def restrict_to(self, names: Iterable[str]) -> Uncertainty:
-        """Return the set restricted to some of its ranges; the others are zero."""
+        """Return the uncertainty with only the named ranges; the others are zero."""
         none = Uncertainty()
         others = {name: getattr(none, name) for name in RANGES if name not in names}
         return replace(self, **others)
@@ -400,7 +428,8 @@ RANGES = {
     "relative_position": ("arms off by {}", 1e3, "mm"),
     "relative_angle": ("turned by {}", 1.0, "rad"),
 }
-"""What is uncertain in an `Uncertainty`, by name: words, and the factor to the unit in them."""
+"""Ranges of an `Uncertainty` by name: the words for messages, and the factor to the unit in these
+words."""
 
 USUAL_UNCERTAINTY = Uncertainty(
     friction=0.20,  # slips of one pair of surfaces spread by 10 %; twice that for another day
@@ -414,14 +443,15 @@ USUAL_UNCERTAINTY = Uncertainty(
     relative_position=0.004,  # drift of the pads in motion: 4 to 20 mm rms
     stated=False,
 )
-"""Taken where a cell states nothing: of a cell that was set up with care. From logs of two UR5e
-that squeeze boxes (adamweinhardt/dual-arm-manipulation, commit 6699139, 206 runs); the tilt there
-contains the arms' relative angle. docs/explanation/robust.md says more."""
+"""Uncertainty of a cell that states none, if it was set up with care. Derived from logs of two UR5e
+that squeeze boxes (adamweinhardt/dual-arm-manipulation, commit 6699139, 206 runs). The tilt in
+these logs contains the arms' relative angle. docs/explanation/robust.md says more."""
 
 
 PARTNER_TIME = 0.2
-"""Assumed time from one arm's stop until the other has gone as far as it will at full speed [s]:
-0.12 s to notice and to tell it, and half of a stop of 0.16 s. Bundles compute their own."""
+"""Time in which an arm at full speed covers the distance by which it still moves after the other
+arm has stopped (assumed) [s]: 0.12 s to notice and report the stop, and half of a stop of 0.16 s.
+Bundles compute their own."""
 
 
 @dataclass(frozen=True)
@@ -429,19 +459,19 @@ class Handling:
     """Motion of the robots before and after the carry.
 
     Attributes:
-        stand_off: distance of both pads from the box before it is gripped and after it is let
-            go, along the contact normals [m].
-        pressing_speed: fastest of the pads between there and the box [m/s].
-        pressing_rate: fastest rise and fall of the normal forces there [N/s].
-        lifting_speed: fastest of the box when it is lifted off and set down [m/s].
-        lift_height: how far below the carry's start the box stands [m]; None for the height above
-            what lies beneath it.
-        set_down_height: likewise below the carry's goal.
-        partner_stop: how far the pads may move apart along the path when one arm stops by itself,
-            until the other one stands as well [m]; None without a limit.
-        grip_time: from when the outputs of hands are switched to when they hold, or have let go
+        stand_off: distance of both pads from the box, along the contact normals, before the box is
+            gripped and after it is released [m].
+        pressing_speed: largest speed of the pads between the stand-off and the box [m/s].
+        pressing_rate: largest rate of the normal forces while pressing and releasing [N/s].
+        lifting_speed: largest speed of the box while it is lifted and set down [m/s].
+        lift_height: height of the carry's start above the box on its support [m]; None for the
+            height above the body beneath it.
+        set_down_height: height of the carry's goal above the box on its support [m]; None likewise.
+        partner_stop: distance by which the pads may move apart along the path if one arm stops on
+            its own, until the other arm has stopped too [m]; None for no limit.
+        grip_time: time from switching the outputs of hands until the hands hold, or have released
             [s].
-        grip_limit: longest wait for the inputs of hands beyond that [s].
+        grip_limit: longest additional wait for the inputs of hands [s].
     """
 
     stand_off: Annotated[float, quantity.STAND_OFF] = 0.05
@@ -456,7 +486,7 @@ class Handling:
 
     @property
     def speed_max(self) -> float:
-        """Largest speed of the box with which `partner_stop` is kept [m/s]."""
+        """Largest speed of the box at which `partner_stop` is satisfied [m/s]."""
         return np.inf if self.partner_stop is None else self.partner_stop / PARTNER_TIME
 
 
@@ -469,10 +499,10 @@ class Reading:
 
     Attributes:
         files: SHA-256 over the workcell file and the content of every file it names.
-        values: SHA-256 over every value of its records, files by their place beside the workcell
-            file.
-        named: what decides which files describe the cell: the paths in its records, and what each
-            robot's description is expanded with.
+        values: SHA-256 over every value of the records; files count by their path relative to the
+            workcell file.
+        named: paths in the records, and arguments with which each robot's description is expanded.
+            They decide which files describe the cell.
     """
 
     files: str
@@ -502,23 +532,23 @@ def _paths(value: Any) -> Iterator[str]:
 
 
 OFFSET_TOLERANCE = 1e-9
-"""Distance between contacts, seen along their normals, from which on they count as beside one
-another [m]."""
+"""Contacts count as laterally offset from this distance on, seen along their normals [m]."""
 
 OPPOSITE = 1e-9
-"""Sum of two unit normals that counts as none."""
+"""Two unit normals count as opposite if their sum is shorter than this."""
 
 SEARCHED_BRANCH = -2
-"""`Workcell.start_branch` of a robot whose branches compete."""
+"""Value in `Workcell.start_branch` of a robot whose branches all compete in the search."""
 
 
 @dataclass(frozen=True)
 class IgnoredPair:
-    """Bodies that collision checking leaves out against each other, with the user's reason.
+    """Two bodies, or groups of bodies, that are not checked for collision against each other, with
+    the user's reason.
 
     Attributes:
         first, second: names of bodies, or patterns with `*` and `?` that stand for several.
-        reason: shown wherever pairs are listed.
+        reason: text that is shown wherever pairs are listed.
     """
 
     first: Label
@@ -533,7 +563,7 @@ class CollisionSettings:
     Attributes:
         tolerance: bodies closer than this count as colliding [m].
         ignored: pairs left out by the user.
-        most_pieces: most convex pieces of all bodies together that are worked with.
+        most_pieces: largest accepted number of convex pieces of all bodies together.
     """
 
     tolerance: Annotated[float, quantity.TOLERANCE] = 0.0
@@ -548,13 +578,14 @@ class Workcell:
     Attributes:
         name: title for reports.
         robots: the two arms; robot i holds contact i.
-        payload, contacts, task, environment, collision, uncertainty, handling: see their records.
-        start_branch: (2,) per robot the index of the start branch among the ranked branches,
-            -1 for the stated criterion's choice, or `SEARCHED_BRANCH`: all compete, see
-            `hybrid_opt.branches`, and until then it is the criterion's choice.
-        source: the file it came from.
-        reading: its state when it was read from `source`.
-        text: what was read in the place of that file's content; None for that.
+        payload, contacts, task, environment, collision, uncertainty, handling: records of the parts
+            of the cell.
+        start_branch: (2,) for each robot the index of the start branch among the ranked branches;
+            -1 for the best by the ranking; `SEARCHED_BRANCH` if all branches compete
+            (`hybrid_opt.branches`), until then the best by the ranking.
+        source: the file that the workcell was read from.
+        reading: state of the workcell when it was read from `source`.
+        text: content that was read in place of the file's content; None for the file's content.
     """
 
     name: str
@@ -572,7 +603,8 @@ class Workcell:
     text: bytes | None = field(default=None, repr=False)
 
     def stack_joint_limits(self, name: str) -> Array:
-        """Stack a limit that each robot states per joint, both arms: (joints,)."""
+        """Return a joint limit of both robots by its attribute's name, side by side (all
+        joints,)."""
         return np.concatenate([getattr(robot, name) for robot in self.robots])
 
     @cached_property
@@ -590,13 +622,13 @@ class Workcell:
 
     @cached_property
     def pad_distance(self) -> float:
-        """Distance of the contacts along the first one's normal [m]."""
+        """Distance of the contacts along the normal of contact 1 [m]."""
         first, second = (contact.T_box_pad[:3, 3] for contact in self.contacts)
         return abs(float((first - second) @ self.contacts[0].T_box_pad[:3, 2]))
 
     @cached_property
     def pad_offset(self) -> float:
-        """Lateral offset of the contacts, seen along the first one's normal [m]."""
+        """Lateral offset of the contacts, perpendicular to the normal of contact 1 [m]."""
         first, second = (contact.T_box_pad[:3, 3] for contact in self.contacts)
         normal, apart = self.contacts[0].T_box_pad[:3, 2], first - second
         return float(np.linalg.norm(apart - (apart @ normal) * normal))
@@ -613,13 +645,13 @@ class Workcell:
 
     @cached_property
     def pad_robots(self) -> tuple[int, ...]:
-        """Per pad the index of the robot that holds it."""
+        """Index of the robot of each pad."""
         return tuple(i for i, c in enumerate(self.contacts) for _ in range(1 + len(c.further)))
 
     @cached_property
     def digest(self) -> str:
-        """Key of the cell in caches and results: SHA-256 over the file and every file it names
-        (URDF, meshes), and over its values if it was changed in memory; '' without files."""
+        """Key of the cell in caches and results: SHA-256 over the file and every file that it names
+        (URDF, meshes), and over the values if the cell was changed in memory; '' without files."""
         if self.reading is None:
             return ""
         files, now = self.reading.files, reading_of(self, "")
@@ -631,7 +663,7 @@ class Workcell:
 
 
 def box_flange(robot: Robot, contact: Contact) -> Array:
-    """Compute T_box_flange (4, 4) of the arm that holds this contact."""
+    """Compute T_box_flange (4, 4) of a robot that holds the box with its pad in this contact."""
     known: Array | None = getattr(robot, "T_box_flange", None)  # of numbers that are symbols
     return contact.T_box_pad @ inverse(robot.T_flange_pad) if known is None else known
 

@@ -14,7 +14,7 @@ import numpy as np
 
 
 def digest_of_parts(value: Any, folder: Path = Path()) -> str:
-    """Compute the SHA-256 of a record's content, part by part; paths relative to a folder."""
+    """Compute the SHA-256 of a record's content, part by part. Paths count relative to `folder`."""
     found: list[bytes] = []
 
     def add(values: Iterable[Any]) -> None:
@@ -54,7 +54,8 @@ def _counted(part: bytes) -> bytes:
 
 @cache
 def _kind(of: type) -> str:
-    """Return how values of a type are divided into parts; cached, since it is called often."""
+    """Return how values of a type are divided into parts. The result is cached, since it is needed
+    often."""
     if of in (str, int, bool, type(None)):
         return "plain"
     known = {tuple: "tuple", np.ndarray: "array", type: "type", ContentRecord: "content"}
@@ -96,7 +97,7 @@ def _record(kind: Hashable) -> tuple[bytes, tuple[str, ...]]:
 
 
 class ContentRecord:
-    """A record that caches its digest, so that equal records are recognised fast."""
+    """A record that caches its digest, so that equal records are recognised quickly."""
 
     @cached_property
     def content(self) -> str:
@@ -110,12 +111,12 @@ class CacheKey:
     differ in few values share most cached results.
 
     Attributes:
-        given: the arguments.
+        given: arguments of the function.
     """
 
     def __init__(self, *given: Any, known: Hashable = None) -> None:
-        """Store the arguments; `known` identifies them, None for a digest of their whole
-        content."""
+        """Store the arguments. `known` identifies them; if None, the digest of their whole content
+        does."""
         self.given = given
         self._known = digest_of_parts(given) if known is None else known
 

@@ -1,9 +1,10 @@
-"""Records whose parameters are symbols: formulas take them where a cell's parameters are inputs.
+"""Records whose parameters are symbols, for functions that take a cell's parameters as inputs.
 
-A formula reads `payload.mass` of either kind of record, so that it is written once. A function made
-of records with symbols has their groups as its last inputs (`symbolic.expression.sx_parameters`); a
-function of plain records has none. A record also holds the numbers that NumPy derives from its own,
-so that compiled code sees the same bits as a constant would have.
+A formula reads `payload.mass` from either kind of record, so it is written once. A function of
+records with symbols has their parameter groups as its last inputs
+(`symbolic.expression.sx_parameters`); a function of plain records has no such inputs. A record also
+holds quantities that NumPy derives from its parameters, so that compiled code sees the same bits as
+a constant would have.
 
 Everything else in a record is topology (`symbolic.parameters.CellParameters`).
 """
@@ -25,8 +26,8 @@ class ParameterGroup:
     """Parameters that functions take as one vector.
 
     Attributes:
-        name: of the input.
-        symbols: (n,) of them.
+        name: name of the input.
+        symbols: (n,) symbols of the parameters.
     """
 
     name: str
@@ -35,12 +36,12 @@ class ParameterGroup:
 
 @dataclass(frozen=True, kw_only=True)
 class NumberedRobot(Robot):
-    """An arm.
+    """An arm whose numbers are symbols.
 
     Attributes:
-        T_box_flange: (4, 4) of the arm as it holds the box.
+        T_box_flange: (4, 4) flange in the box frame while the arm holds the box.
         lever: (3,) from the flange to the contact point, box axes [m].
-        given: its numbers.
+        given: the arm's numbers as one group.
     """
 
     T_box_flange: Any = None
@@ -50,16 +51,24 @@ class NumberedRobot(Robot):
 
 @dataclass(frozen=True)
 class NumberedPayload(Payload):
-    """The payload. given: its parameters, with those of the contacts."""
+    """The payload with symbols as parameters.
+
+    Attributes:
+        given: parameters of payload and contacts as one group.
+    """
 
     given: ParameterGroup | None = None
 
 
 @dataclass(frozen=True)
 class NumberedContact(Contact):
-    """A contact. twist, spread: see `symbolic.contact.soft_finger.SoftPatch`. share, opposed: of
-    a hand that holds by itself, see `symbolic.contact.elastic.layer_shares` and
-    `symbolic.contact.holding_hands.internal_force_needs`."""
+    """A contact with symbols as parameters.
+
+    Attributes:
+        twist, spread: lengths of the patch (`symbolic.contact.soft_finger.SoftPatch`).
+        share: for a hand, its matrix of `symbolic.contact.elastic.layer_shares`.
+        opposed: for a hand, its row of `symbolic.contact.holding_hands.internal_force_needs`.
+    """
 
     twist: Any = None
     spread: Any = None
@@ -69,7 +78,7 @@ class NumberedContact(Contact):
 
 @dataclass(frozen=True)
 class NumberedWaypoint(Waypoint):
-    """A pose of the path; only a fixed one has parameters."""
+    """A pose of the path. Only a fixed pose has parameters."""
 
     fixed: bool = False
 
@@ -81,42 +90,52 @@ class NumberedWaypoint(Waypoint):
 
 @dataclass(frozen=True)
 class NumberedJoint(RedundantJoint):
-    """A redundant joint. free: waypoints at which it is a variable; elsewhere `lower` holds its
-    parameters."""
+    """A redundant joint with symbols as parameters.
+
+    Attributes:
+        free: True for waypoints at which the joint is a variable; at the others `lower` is a
+            parameter.
+    """
 
     free: tuple[bool, ...] = ()
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """(n_waypoints,) True where its value is a decision variable."""
+        """(n_waypoints,) True for waypoints at which the value is a decision variable."""
         return np.array(self.free, dtype=np.bool_)
 
 
 @dataclass(frozen=True, kw_only=True)
 class NumberedTask(Task):
-    """A task. given: its parameters."""
+    """A task with symbols as parameters.
+
+    Attributes:
+        given: the task's parameters as one group.
+    """
 
     given: ParameterGroup | None = None
 
 
 @dataclass(frozen=True)
 class GraspNumbers:
-    """Quantities that NumPy derives for grasps by pads with any normals, beside the pads' own
-    parameters: n entries of all pads' states; b rows of balance.
+    """Constants that NumPy derives for grasps by pads with any normals. The states of all pads have
+    n entries; the balance has b rows.
 
     Attributes:
-        left: (b,) the dependent ones of the n components.
-        squeeze: (n,) internal squeeze to start from.
-        spread: (n, 6) the least states that balance a load.
-        load_to_left, free_to_left: (b, 6) and (b, n - b), what the load and the free components
-            leave to the others, in units of `symbolic.contact.grasp.Grasp.units`.
-        to_robots: (6, 6 k) from all pads' wrenches to force and moment of the robot that has the
-            pad, see `symbolic.contact.force_closure`.
-        shapes: lengths of each pad over its radius, on which its cone depends; () of a disc.
-        load_at_rest: (6,) direction of the load at the start.
-        rest, rest_slopes: (n,) and (n, 6) states on the central path there, and their slopes.
-        reach: size of the patches that the squeeze lies within, over the cell's own.
-        given: the group of those that are symbols.
+        left: (b,) indices of the dependent components among the n.
+        squeeze: (n,) initial internal squeeze.
+        spread: (n, 6) matrix from a load to the least-norm states that balance it.
+        load_to_left, free_to_left: (b, 6) and (b, n - b) matrices from the load and from the free
+            components to the dependent components, in units of
+            `symbolic.contact.grasp.Grasp.units`.
+        to_robots: (6, 6 k) matrix from all pads' wrenches to the first robot's force and moment,
+            from `symbolic.contact.force_closure.robot_wrenches`.
+        shapes: lengths of each pad over its radius, on which its cone depends; () for a disc.
+        load_at_rest: (6,) direction of the load at rest at the start.
+        rest, rest_slopes: (n,) states on the central path under this load, and (n, 6) their
+            derivatives by the load.
+        reach: size of the patches within which the squeeze lies, over the cell's own size.
+        given: the constants that are symbols, as one group.
     """
 
     left: tuple[int, ...]
@@ -135,12 +154,13 @@ class GraspNumbers:
 
 @dataclass(frozen=True)
 class NumberedWorkcell(Workcell):
-    """A cell with the pads' arrangement fixed and its parameters symbolic.
+    """A cell with a fixed arrangement of pads and symbols as parameters.
 
     Attributes:
-        facing, opposite, beside: see the properties of `Workcell`.
-        grasp: of pads anywhere, else None.
-        squeezes: likewise, where either robot's force is commanded.
+        facing, opposite, beside: values of `has_facing_pads`, `has_opposite_pads` and
+            `has_offset_pads`.
+        grasp: constants of a grasp by pads with any normals, else None.
+        squeezes: constants of its programs of commanded forces, for either robot; else None.
     """
 
     facing: bool = False

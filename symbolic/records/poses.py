@@ -28,15 +28,15 @@ Rotation = Literal["roll-pitch-yaw", "quaternion"]
 
 @dataclass(frozen=True)
 class Orientation:
-    """Map from three numbers [rad] to R_world_box.
+    """Convention by which three numbers [rad] describe R_world_box.
 
-    'roll-pitch-yaw', the paper's: Rz(yaw) Ry(pitch) Rx(roll). 'quaternion': a rotation vector v
-    along the world's axes, whose unit quaternion (cos |v|/2, sin |v|/2 v/|v|) turns the reference:
-    R_world_box = exp(v) R_reference.
+    'roll-pitch-yaw' is the paper's: Rz(yaw) Ry(pitch) Rx(roll). 'quaternion' is a rotation vector v
+    along the world's axes with the unit quaternion (cos |v|/2, sin |v|/2 v/|v|): R_world_box =
+    exp(v) R_reference.
 
     Attributes:
-        rotation: which of the two.
-        reference: (3, 3), R_world_box at v = 0; of 'quaternion' only.
+        rotation: 'roll-pitch-yaw' or 'quaternion'.
+        reference: (3, 3) R_world_box at v = 0; only for 'quaternion'.
     """
 
     rotation: Rotation = "roll-pitch-yaw"
@@ -44,8 +44,8 @@ class Orientation:
 
     @property
     def is_vector(self) -> bool:
-        """True if the numbers are a rotation vector; else they are angles, each periodic in full
-        turns."""
+        """True if the numbers are a rotation vector, False if they are angles, each periodic in
+        full turns."""
         return self.rotation == "quaternion"
 
     @property
@@ -57,7 +57,7 @@ class Orientation:
 
     @cached_property
     def unwrapped(self) -> Callable[[Array], Array]:
-        """Function of numbers (..., n, 3) along a path to the same with angles unwrapped."""
+        """Function that unwraps the angles of numbers (..., n, 3) along a path."""
         return np.asarray if self.is_vector else partial(np.unwrap, axis=-2)
 
 
@@ -152,6 +152,6 @@ def inverse(T_a_b: Array) -> Array:
 
 
 def skew(vector: ArrayLike) -> Array:
-    """Return the matrix (3, 3) whose product with a vector is the cross product of (3,) with it."""
+    """Return the matrix (3, 3) of the cross product with a vector (3,): skew(a) @ b = a x b."""
     x, y, z = np.asarray(vector, dtype=float)
     return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])

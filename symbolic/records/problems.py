@@ -1,4 +1,4 @@
-"""Problems of a file collected by key path, words for their messages, and patterns of names."""
+"""Collector of a file's problems by key path, words for their messages, and patterns of names."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ MAX_NAME_LENGTH = 80
 
 
 MOST_LETTERS = 2000
-"""Longest text of a problem: it may quote what was found, or list what is allowed."""
+"""Largest length of the text of a problem, which may quote the found value or list the allowed
+ones."""
 
 MOST_PROBLEMS = 100
-"""Most problems of a file that are listed; the rest is counted."""
+"""Largest number of problems of a file that are listed; further ones are counted."""
 
 
 LONGEST_SUGGESTION = 200
-"""Longest word for which a similar one is looked for."""
+"""Similar words are looked for only if the misspelt word is not longer."""
 
 
 @dataclass
 class Problems:
-    """The problems found so far, as (key path, text)."""
+    """The problems found so far, as pairs of key path and text."""
 
     found: list[tuple[str, str]] = field(default_factory=list)
 
@@ -38,9 +39,10 @@ class Problems:
     """True if unknown keys are no problem."""
 
     def add(self, path: str, text: str) -> None:
-        """Record that the value at `path` is wrong; `text` states the found and the allowed value.
+        """Record that the value at key path `path` is wrong. `text` states the found and the
+        allowed value.
 
-        After `MOST_PROBLEMS` they are only counted.
+        After `MOST_PROBLEMS` problems are only counted.
         """
         if len(self.found) < MOST_PROBLEMS:
             told = text if len(text) <= MOST_LETTERS else f"{text[: MOST_LETTERS - 4]} ..."
@@ -57,19 +59,19 @@ class Problems:
         )
 
     def messages(self) -> tuple[str, ...]:
-        """Return all problems as `key.path: text`, and the number of those not listed."""
+        """Return all problems as `key.path: text`, and a line with the number of further ones."""
         told = tuple(f"{path}: {text}" for path, text in self.found)
         return (*told, f"and {self.uncounted} more") if self.uncounted else told
 
 
 class FirstProblem(Problems):
-    """Raises the first problem at once."""
+    """Collector that raises the first problem at once."""
 
     def add(self, path: str, text: str) -> None:
         """Raise the problem.
 
         Raises:
-            ValueError: with the place and the text.
+            ValueError: always; the message has the key path and the text.
         """
         raise ValueError(f"{path}: {text}")
 
@@ -79,7 +81,7 @@ def _is_within(path: str, prefix: str) -> bool:
 
 
 def suggestion(word: str, candidates: Iterable[str]) -> str:
-    """Return a 'did you mean' for a misspelt word, or an empty string."""
+    """Return a 'did you mean' for a misspelt word, or '' if no candidate is similar."""
     if len(word) > LONGEST_SUGGESTION:
         return ""
     close = difflib.get_close_matches(word, list(candidates), n=1, cutoff=0.6)
@@ -87,16 +89,16 @@ def suggestion(word: str, candidates: Iterable[str]) -> str:
 
 
 def shown(value: Any) -> str:
-    """Return a value as a short single line for a message, control characters escaped.
+    """Return a value as a short single line for a message, with control characters escaped.
 
-    Of a long one both ends: a path is known by its last part.
+    A long value is shortened in the middle, since a path is recognised by its last part.
     """
     text = _short.repr(value)
     return text if len(text) <= 60 else f"{text[:28]}...{text[-29:]}"
 
 
 class _Short(reprlib.Repr):
-    """`repr` that reads only as much of a value as a message can show."""
+    """A `repr` that reads only as much of a value as a message can show."""
 
     def repr_int(self, x: int, level: int) -> str:
         """Return an integer's digits, or its number of bits: Python refuses thousands of digits."""
@@ -109,7 +111,7 @@ _short.maxlist = _short.maxdict = 60
 
 
 def text_problem(value: Any) -> str:
-    """Return the fault of a value as a text for reports, or an empty string."""
+    """Return what is wrong with a value as a text for reports; '' if nothing is."""
     if not isinstance(value, str):
         return "allowed is a text"
     if not value.strip():
@@ -128,7 +130,8 @@ Label = Annotated[str, TextPattern(text_problem)]
 
 
 def text_pattern(pattern: str, meaning: str) -> TextPattern:
-    """Return the form of texts that match a pattern; `meaning` describes it in messages."""
+    """Return a `TextPattern` of the texts that match a regular expression; `meaning` describes it
+    in messages."""
     form = re.compile(pattern)
 
     def problem(value: Any) -> str:
@@ -141,9 +144,9 @@ def text_pattern(pattern: str, meaning: str) -> TextPattern:
 
 
 def matching(pattern: str, names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names that match a pattern: `*` is any text, `?` any character.
+    """Return the names that match a pattern: `*` stands for any text, `?` for any character.
 
-    A name that is written out stands for itself, also where it holds such a character.
+    A pattern that equals a name matches this name only, even if it contains such characters.
     """
     names = tuple(names)
     if pattern in names:

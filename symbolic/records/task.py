@@ -1,9 +1,9 @@
 """The task of a carry, and its decision vector.
 
-The decision vector holds the free waypoints of a task's path, one after the other. The free values
-of the redundant joints follow them, joint by joint; in drivable cells the force limit
-[N] is the last. Here they are put into the path, and taken out, as numbers; as expressions it is
-`symbolic.path.spline.waypoint_matrix` and `extended_matrix`.
+The decision vector holds the free waypoints of a task's path in order, then the free values of the
+redundant joints, joint by joint; in drivable cells the force limit [N] is the last entry. The
+functions here convert between decision vectors and paths as numbers.
+`symbolic.path.spline.waypoint_matrix` and `extended_matrix` do so as expressions.
 """
 
 from __future__ import annotations
@@ -23,15 +23,16 @@ from symbolic.records.problems import Label
 from symbolic.records.time_law import CONSTANT, TIME_LAWS, TimeLaw
 
 POSE_SIZE = 6
-"""x, y, z [m] and three numbers of the orientation [rad], see `symbolic.records.poses`."""
+"""Number of entries of a pose: x, y, z [m] and three numbers of the orientation [rad]
+(`symbolic.records.poses`)."""
 
 
 @dataclass(frozen=True)
 class Waypoint:
-    """A pose of the box path: fixed where lower equals upper, otherwise free within them.
+    """A pose of the box path: fixed if lower equals upper, otherwise free between them.
 
     Attributes:
-        lower, upper: (6,) poses [m, rad].
+        lower, upper: (6,) bounds of the pose [m, rad].
     """
 
     lower: Array
@@ -47,14 +48,16 @@ class Waypoint:
 class RedundantJoint:
     """A joint beyond the six that follow the box: its path is part of the decision vector.
 
-    Its values at the waypoints are joined by the spline of the box path. A joint that moves both
-    arms of a machine is one of these, not two.
+    The spline of the box path joins its values at the waypoints. A joint that moves both arms of a
+    machine is one redundant joint, not two.
 
     Attributes:
-        name: robot and joint, as 'north/panda_joint3'.
-        drives: per robot its index among the arm's joints, -1 where it is none of them.
-        lower, upper: (n_waypoints,) bounds [rad or m]; equal where it is fixed.
-        initial: (n_waypoints,) its path in the hand-made trajectory [rad or m].
+        name: robot and joint, such as 'north/panda_joint3'.
+        drives: for each robot the index of the joint among the arm's joints; -1 if the arm does not
+            have it.
+        lower, upper: (n_waypoints,) bounds at the waypoints [rad or m]; equal at waypoints where
+            the joint is fixed.
+        initial: (n_waypoints,) values in the hand-made trajectory [rad or m].
     """
 
     name: str
@@ -65,23 +68,23 @@ class RedundantJoint:
 
     @property
     def is_common(self) -> bool:
-        """True if it moves both arms."""
+        """True if the joint moves both arms."""
         return min(self.drives) >= 0
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """(n_waypoints,) True where its value is a decision variable."""
+        """(n_waypoints,) True for waypoints at which the value is a decision variable."""
         return np.asarray(self.lower < self.upper)
 
 
 @dataclass(frozen=True)
 class AllowedContact:
-    """The payload may touch a named environment body near the fixed poses.
+    """Permission for the payload to touch a named environment body near fixed poses.
 
     Attributes:
         body: name of the environment body.
-        departure: the contact is allowed while the box centre is within this distance of a
-            fixed waypoint at which the payload touches (or is within tolerance of) the body [m].
+        departure: distance of the box centre from a fixed waypoint within which contact is allowed
+            [m], if the payload touches the body at this waypoint, up to the tolerance.
     """
 
     body: Label
@@ -95,19 +98,20 @@ class Task:
     Attributes:
         waypoints: the ordered poses of the path; the first and last are fixed.
         samples: number of samples along the path, ends included.
-        time_law: name of the time law, see `symbolic.records.time_law`.
-        reference_speed: [m/s], speed of the box centre, or cruise speed between ramps.
-        reference_angular_speed: [rad/s], for steps that mostly rotate.
-        ramp_time: [s], duration of each ramp, if the speed has any.
-        reference_force: (2,) [N], normalises each robot's normal force.
-        initial: (n_free, 6), the hand-made trajectory's free waypoints.
-        allowed_contacts: contacts that are no collisions, see AllowedContact.
-        allocation: name of the contact model, see `symbolic.contact.registry`.
+        time_law: name of the time law (`symbolic.records.time_law`).
+        reference_speed: speed of the box centre, or cruise speed between ramps [m/s].
+        reference_angular_speed: angular speed for steps that mostly rotate [rad/s].
+        ramp_time: duration of each ramp, if the time law has ramps [s].
+        reference_force: (2,) force that normalises each robot's normal force [N].
+        initial: (n_free, 6) free waypoints of the hand-made trajectory.
+        allowed_contacts: contacts that do not count as collisions.
+        allocation: name of the contact model (`symbolic.contact.registry`).
         force_limit: (2,) bounds of the force limit, the last decision variable of drivable
             carries [N].
-        redundant: the joints whose paths are decided beside the box's, see RedundantJoint.
+        redundant: joints whose paths are part of the decision vector.
         orientation: meaning of the last three numbers of every pose.
-        pieces: of the path between two waypoints that its file states, see `symbolic.path.pieces`.
+        pieces: number of pieces of the path between two waypoints of the file
+            (`symbolic.path.pieces`).
     """
 
     waypoints: tuple[Waypoint, ...]
@@ -127,13 +131,13 @@ class Task:
 
     @cached_property
     def extended_size(self) -> int:
-        """Entries of an extended pose: the box pose, then the redundant joints."""
+        """Number of entries of an extended pose: the box pose, then the redundant joints."""
         return POSE_SIZE + len(self.redundant)
 
     @cached_property
     def redundant_places(self) -> tuple[tuple[tuple[int, int], ...], ...]:
-        """Per robot and redundant joint of it: its index in the arm and its place in the extended
-        pose."""
+        """For each robot one pair per redundant joint of the robot: its index among the arm's
+        joints, and its index in the extended pose."""
         return tuple(
             tuple(
                 (joint.drives[arm], POSE_SIZE + k)
@@ -145,7 +149,7 @@ class Task:
 
     @cached_property
     def free_indices(self) -> tuple[int, ...]:
-        """Positions of the free waypoints in `waypoints`."""
+        """Indices of the free waypoints in `waypoints`."""
         return tuple(i for i, w in enumerate(self.waypoints) if not w.is_fixed)
 
     @cached_property
@@ -185,7 +189,7 @@ class Task:
 
     @cached_property
     def fixed_waypoints(self) -> Array:
-        """(n_waypoints, 6 + m) extended waypoints, with free entries at their lower bounds;
+        """(n_waypoints, 6 + m) extended waypoints in which free entries have their lower bounds;
         read-only."""
         poses = np.array([waypoint.lower for waypoint in self.waypoints])
         points = np.column_stack([poses, *[joint.lower for joint in self.redundant]])
@@ -194,13 +198,13 @@ class Task:
 
     @cached_property
     def law(self) -> TimeLaw:
-        """The time law."""
+        """The time law with the name `time_law`."""
         return TIME_LAWS[self.time_law]
 
     @cached_property
     def n_var(self) -> int:
-        """Number of decision variables: those of the path, and the force limit of drivable
-        carries."""
+        """Number of decision variables: the variables of the path, and in drivable cells the force
+        limit."""
         return self.n_path + self.law.is_drivable
 
     @property
@@ -223,19 +227,19 @@ class Task:
 
 
 def components(orientation: Orientation) -> tuple[str, ...]:
-    """Return the names of the numbers of a pose [m, rad]."""
+    """Return the names of the six entries of a pose."""
     return ("x", "y", "z", *orientation.components)
 
 
 def waypoints_of(task: Task, x: Array) -> Array:
-    """Return all waypoints (..., n_waypoints, 6) of decision vectors (..., n_var), angles
-    unwrapped."""
+    """Return all waypoints (..., n_waypoints, 6) of decision vectors x (..., n_var), with unwrapped
+    angles."""
     return extended_waypoints(task, x)[..., :POSE_SIZE]
 
 
 def extended_waypoints(task: Task, x: Array) -> Array:
-    """Return all waypoints (..., n_waypoints, 6 + m) of decision vectors (..., n_var): poses, then
-    redundant joints."""
+    """Return all extended waypoints (..., n_waypoints, 6 + m) of decision vectors x (..., n_var):
+    poses, then redundant joints."""
     points = np.empty((*x.shape[:-1], *task.fixed_waypoints.shape))
     points[...] = task.fixed_waypoints
     rows, columns = task.free_entries
@@ -245,23 +249,23 @@ def extended_waypoints(task: Task, x: Array) -> Array:
 
 
 def place_redundant(task: Task, extended: Array, joints: Sequence[Array]) -> None:
-    """Write the redundant joints of the extended poses (n, 6 + m) into both arms' joints (n,
-    joints), in place."""
+    """Write the redundant joints of extended poses (n, 6 + m) into the joints (n, joints) of both
+    arms, in place."""
     for arm, q in enumerate(joints):
         for joint, place in task.redundant_places[arm]:
             q[:, joint] = extended[:, place]
 
 
 def decision_of(task: Task, waypoints: Array) -> Array:
-    """Return the decision vector (n_var,) of all waypoints (n_waypoints, 6 + m); a force limit
-    takes its upper bound."""
+    """Return the decision vector (n_var,) of all extended waypoints (n_waypoints, 6 + m). A force
+    limit gets its upper bound."""
     path = np.array(waypoints[task.free_entries], dtype=float)
     return np.append(path, task.force_limit[1]) if task.law.is_drivable else path
 
 
 def initial_decision(task: Task) -> Array:
-    """Return the decision vector (n_var,) of the hand-made trajectory; a force limit takes its
-    upper bound."""
+    """Return the decision vector (n_var,) of the hand-made trajectory. A force limit gets its upper
+    bound."""
     points = np.array([waypoint.lower for waypoint in task.waypoints])
     points[list(task.free_indices)] = task.initial
     return decision_of(task, _beside_initial(task, points))
@@ -272,8 +276,8 @@ def _beside_initial(task: Task, poses: Array) -> Array:
 
 
 def straight_line(task: Task) -> Array:
-    """Return free waypoints (n_var,) evenly spaced on the straight lines between the fixed ones,
-    with the redundant joints of the hand-made trajectory."""
+    """Return the decision vector (n_var,) with free waypoints evenly spaced on straight lines
+    between the fixed ones. Redundant joints are those of the hand-made trajectory."""
     fixed = [i for i, waypoint in enumerate(task.waypoints) if waypoint.is_fixed]
     poses = np.array([waypoint.lower for waypoint in task.waypoints])
     numbers = np.arange(len(task.waypoints))
@@ -282,7 +286,7 @@ def straight_line(task: Task) -> Array:
 
 
 def variable_names(task: Task) -> tuple[str, ...]:
-    """Return the names of the decision variables (n_var,); waypoints count from 1, after the
+    """Return the names of the decision variables (n_var,). Waypoints count from 1, after the
     start."""
     names = [*components(task.orientation), *(joint.name for joint in task.redundant)]
     rows, columns = task.free_entries

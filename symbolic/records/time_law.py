@@ -1,6 +1,6 @@
 """The time laws that workcell files can name.
 
-`symbolic.path.time_law` has the expressions of those whose times follow from the path.
+`symbolic.path.time_law` has the expressions of the laws whose times follow from the path.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ CONSTANT, RAMPED, OPTIMAL = "constant", "ramped", "optimal"
 
 @dataclass(frozen=True)
 class TimeLaw:
-    """How a path is driven.
+    """The rule by which a path gets its times.
 
     Attributes:
-        name: in workcell files.
-        title: in words.
-        is_drivable: True if every path gets the fastest timing from rest to rest within all limits
-            and a force limit, which then is the last decision variable; else times follow from the
-            path by an expression.
-        has_differences: True if velocity and acceleration at a sample are finite differences of
+        name: name in workcell files.
+        title: name in sentences.
+        is_drivable: True if every path gets its fastest timing from rest to rest within all limits
+            and a force limit, which is then the last decision variable. False if the times follow
+            from the path by an expression.
+        has_differences: True if velocity and acceleration at a sample are finite differences with
             its neighbours.
     """
 
@@ -38,4 +38,4 @@ TIME_LAWS = {
         TimeLaw(OPTIMAL, "fastest within limits", is_drivable=True),
     )
 }
-"""Time laws by the name that `task.time_law` of a workcell file has."""
+"""Time laws by their name in `task.time_law` of a workcell file."""

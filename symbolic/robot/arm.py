@@ -1,11 +1,11 @@
 """One arm that follows the box: inverse kinematics along the samples, limits and joint torques.
 
-Paper Eqs. 29-33 and 61-62. The flange's target follows from the box pose alone, so both arms
-keep the relative grasp exactly; an arm's redundant joints are where the extended pose says
-(`RobotModel`), the other six follow. Newton's method is warm started by quadratic extrapolation of
-the previous samples, and its residual is measured. Two cheap steps suffice nearly everywhere. A
-third follows where the second started too far away. If that is not enough, `IK_NEWTON_STEPS` steps
-by QR factors decide: a sample counts as lost only if they do not reach it either.
+Paper Eqs. 29-33 and 61-62. The flange's target follows from the box pose alone, so both arms keep
+the relative grasp exactly. The extended pose sets an arm's redundant joints (`RobotModel`); the
+other six follow. Newton's method is warm started by quadratic extrapolation of the previous
+samples, and its residual is measured. Two cheap steps suffice nearly everywhere. A third follows if
+the second started too far away. If that is not enough, `IK_NEWTON_STEPS` steps by QR factors
+decide: a sample counts as lost only if they do not reach it either.
 """
 
 from __future__ import annotations
@@ -36,21 +36,21 @@ Models = tuple[RobotModel, RobotModel]
 Contacts = tuple[Contact, Contact]
 
 IK_NEWTON_STEPS = 3
-"""Newton steps per sample; extrapolation brings the start within their basin."""
+"""Number of Newton steps per sample; extrapolation starts them within their basin."""
 
 BEGIN_STEPS = 12
-"""Newton steps in which an arm's redundant joints go from the start posture to where a candidate
-has them at the first sample."""
+"""Number of Newton steps in which an arm's redundant joints move from the start posture to their
+positions at a candidate's first sample."""
 
 CHEAP_STEPS = 2
-"""Newton steps by blocks that every sample gets."""
+"""Number of Newton steps by blocks that every sample gets."""
 
 THIRD_STEP_RESIDUAL = 1e-5
-"""Pose residual before the last cheap step above which one more is made [m, rad]; Newton's method
-squares it, within a factor of about 5."""
+"""If the pose residual before the last cheap step exceeds this, one more step is made [m, rad].
+Newton's method squares the residual, within a factor of about 5."""
 
 TRUSTED_RESIDUAL = 1e-9
-"""Pose residual above which the cheap steps are not trusted [m, rad]."""
+"""Cheap steps are not trusted if their pose residual exceeds this [m, rad]."""
 
 REACH_TOLERANCE = 1e-6
 """Largest pose residual of a reached sample [m, rad]: a twentieth of the arm's repeatability."""
@@ -58,11 +58,11 @@ REACH_TOLERANCE = 1e-6
 TRACK_OUTPUTS = ("q", "ik_residual", "lost", "limit_margin", "manipulability", "joint_torque")
 """Outputs of `track_function` after the state.
 
-q (n,) [rad, or m where a joint slides], held at the last reached sample once the path is lost.
-ik_residual: pose residual of q [m, rad]. lost: 0 while this and all earlier samples were reached
-without a jump, else 1. limit_margin: least distance to a joint limit, negative beyond it [rad].
-manipulability: |det J| of the flange by the six joints that follow [m^3]. joint_torque (n,): torque
-that exerts the contact wrench [N m, or N].
+q (n,) [rad, or m for a sliding joint]; once the path is lost, the joints of the last reached
+sample. ik_residual: pose residual of q [m, rad]. lost: 0 while this and all earlier samples were
+reached without a jump, else 1. limit_margin: least distance to a joint limit, negative beyond it
+[rad]. manipulability: |det J| of the flange by the six joints that follow [m^3]. joint_torque (n,):
+torque that exerts the contact wrench [N m, or N for a sliding joint].
 """
 
 
@@ -111,11 +111,11 @@ def joint_torque(
 
 
 def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str) -> ca.Function:
-    """Build the function of one sample of an arm's motion, to be accumulated along the path.
+    """Build the function of one sample of an arm's motion, which is applied to the samples in turn.
 
-    Inputs: state (3 n + 1,) = joints at the previous sample, their last change, that change's own
-    change, and `lost`; the extended pose; wrench (6,) on the box about the nominal contact point.
-    Outputs: the next state, then `TRACK_OUTPUTS`.
+    Inputs: state (3 n + 1,), the joints at the previous sample, their first and second difference,
+    and `lost`; the extended pose; wrench (6,) on the box about the nominal contact point. Outputs:
+    the next state, then `TRACK_OUTPUTS`.
     """
     n = model.n_joints
     state, pose = ca.MX.sym("state", 3 * n + 1), ca.MX.sym("pose", model.pose_size)
@@ -154,8 +154,8 @@ def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
 
 
 def torque_function(robot: Robot, model: RobotModel, contact: Contact, name: str) -> ca.Function:
-    """Build the function from joints (n,), extended pose and wrench, as in `track_function`, to
-    joint_torque (n,)."""
+    """Build the function from joints (n,), extended pose and wrench (6,) on the box to joint_torque
+    (n,) [N m]."""
     q, pose = ca.SX.sym("q", model.n_joints), ca.SX.sym("pose", model.pose_size)
     wrench = ca.SX.sym("wrench", 6)
     rotation = rotation_matrix(model.orientation, pose[3:6])
@@ -165,15 +165,15 @@ def torque_function(robot: Robot, model: RobotModel, contact: Contact, name: str
 
 
 def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str, ca.Function]:
-    """Build the steps of `track_function`; conditional ones copy their input if the condition is
-    false.
+    """Build the steps of `track_function` by name. Conditional steps copy their input if the
+    condition is false.
 
     target: pose -> R_world_box, and the flange's target. approach: state, pose, target -> joints
-    after `CHEAP_STEPS`, the residual before the last. closer: joints, target -> joints one step on.
-    place: joints, target -> joints, residual, jacobian. again: state, pose, target and what `place`
-    found -> the better of that and `IK_NEWTON_STEPS` steps by QR. held: previous joints, target and
-    what was found -> what `place` finds at the previous joints. measures: joints, jacobian,
-    R_world_box, wrench -> limit margin, manipulability, joint torque.
+    after `CHEAP_STEPS`, and the residual before the last step. closer: joints, target -> joints
+    after one more step. place: joints, target -> joints, residual, jacobian. again: state, pose,
+    target, result of `place` -> the better of this result and `IK_NEWTON_STEPS` steps by QR. held:
+    previous joints, target, result so far -> result of `place` at the previous joints. measures:
+    joints, jacobian, R_world_box, wrench -> limit margin, manipulability, joint torque.
     """
     n = model.n_joints
     state, pose = ca.SX.sym("state", 3 * n + 1), ca.SX.sym("pose", model.pose_size)
@@ -215,7 +215,7 @@ def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str,
 
 
 def _placed(model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX) -> list[ca.SX]:
-    """Return the joints (n,), their pose residual and their Jacobian (6, n)."""
+    """Return the joints q (n,), their pose residual [m, rad] and the flange's Jacobian (6, n)."""
     R, p, jacobian = model.kinematics(q)
     return [q, pose_error(R_target, p_target, R, p)[1], jacobian]
 
@@ -227,8 +227,8 @@ def _function(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Functi
 def _where(
     name: str, inputs: list[ca.SX], results: list[ca.SX], otherwise: list[ca.SX]
 ) -> ca.Function:
-    """Build a function that returns the results if its first input is true, else the inputs
-    `otherwise`."""
+    """Build a conditional function: it returns `results` if its first input is true, else the
+    inputs `otherwise`."""
     chosen = _function(name, inputs, results)
     left = _function(f"{name}_not", inputs, otherwise)
     return ca.Function.if_else(f"{name}_where", chosen, left)
@@ -239,11 +239,12 @@ def follow_function(
 ) -> ca.Function:
     """Build the function of an arm's motion along all samples of a box path.
 
-    Inputs: start (n,), joints at the first box pose [rad]; pose (6 + m, samples), extended; wrench
-    (6, samples) on the box about the nominal contact point. Outputs: `TRACK_OUTPUTS`.
+    Inputs: start (n,), joints at the first box pose [rad]; pose (6 + m, samples), the extended
+    poses; wrench (6, samples) on the box about the nominal contact point. Outputs: `TRACK_OUTPUTS`
+    of all samples.
 
-    The second sample has no motion before it to extrapolate: Newton steps from the start posture
-    predict it, and what they find takes the extrapolation's place.
+    For the second sample there is no earlier motion to extrapolate. Newton steps from the start
+    posture predict it instead.
     """
     start, pose = ca.MX.sym("start", model.n_joints), ca.MX.sym("pose", model.pose_size, samples)
     wrench, given = ca.MX.sym("wrench", 6, samples), mx_parameters(robot)
@@ -269,9 +270,9 @@ def follow_function(
 def start_function(robot: Robot, model: RobotModel, contact: Contact, name: str) -> ca.Function:
     """Build the function of the state of `track_function` before the first sample.
 
-    Inputs: start (n,), joints at the first box pose; extended, the first extended pose. An arm's
-    redundant joints move from the one to the other, evenly, in `BEGIN_STEPS` Newton steps that keep
-    the box.
+    Inputs: start (n,), joints at the first box pose; extended, the first extended pose. The
+    redundant joints move evenly from their start positions to those of the extended pose, in
+    `BEGIN_STEPS` Newton steps that keep the flange at the box.
     """
     n = model.n_joints
     start, pose = ca.MX.sym("start", n), ca.MX.sym("pose", model.pose_size)
@@ -318,8 +319,9 @@ def prediction_function(
 def posture_function(robots: Arms, models: Models, contacts: Contacts) -> ca.Function:
     """Build the function of both arms' postures at one box pose, from nearby joint positions.
 
-    Inputs: pose (6,) of the box; guess_1, guess_2 (n,) [rad], whose redundant joints stay. Outputs:
-    q_1, q_2 (n,) after `IK_NEWTON_STEPS`; residual_1, residual_2, their pose residuals [m, rad].
+    Inputs: pose (6,) of the box; guess_1, guess_2 (n,) nearby joints [rad]. Outputs: q_1, q_2 (n,)
+    after `IK_NEWTON_STEPS`, with the redundant joints of the guess; residual_1, residual_2, their
+    pose residuals [m, rad].
     """
     pose = ca.SX.sym("pose", 6)
     guesses = [ca.SX.sym(f"guess_{i + 1}", model.n_joints) for i, model in enumerate(models)]
@@ -343,10 +345,10 @@ def posture_function(robots: Arms, models: Models, contacts: Contacts) -> ca.Fun
 
 
 MAX_JOINT_STEP = 0.5
-"""Largest change of a joint in one Newton step, and between samples of one motion [rad]."""
+"""Largest change of a joint in one Newton step, and between two samples of one motion [rad]."""
 
 _POSTURES = 200
-"""Random postures in which the axes of an arm are compared."""
+"""Number of random postures in which the axes of an arm are compared."""
 
 
 def pose_error(R_target: ca.SX, p_target: ca.SX, R: ca.SX, p: ca.SX) -> tuple[ca.SX, ca.SX]:
@@ -375,12 +377,12 @@ def newton_step(model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX) -
 def block_step(
     model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """Make a Newton step of the six joints with fewer operations; also return the pose residual
-    before it.
+    """Return the joints (n,) after a Newton step of the six joints with few operations, and the
+    pose residual before the step.
 
     The angular rows give three joints in terms of the others by Cramer's rule, and the rest is
-    again a 3 by 3 system. Without pivoting: not to be trusted where the three axes nearly lie in a
-    plane, of which the next residual tells.
+    again a 3 by 3 system. There is no pivoting: the step fails where the three axes nearly lie in a
+    plane, and the next residual shows this.
     """
     R, p, whole = model.kinematics(q)
     jacobian = following_columns(model, whole)
@@ -412,8 +414,8 @@ def _cramer(A: ca.SX) -> Callable[[ca.SX], ca.SX]:
 
 @lru_cache(maxsize=8)
 def _independent_axes(model: RobotModel) -> tuple[int, ...]:
-    """Return the three of the six joints whose axes stay farthest from a common plane in random
-    postures."""
+    """Return the indices of those three of the six joints whose axes stay farthest from a common
+    plane in random postures."""
     lower, upper = model.model.lowerPositionLimit, model.model.upperPositionLimit
     postures = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, len(lower)))
     jacobians = np.array(model.jacobian.map(_POSTURES)(postures.T)).reshape(6, _POSTURES, -1)
@@ -431,7 +433,8 @@ def following_columns(model: RobotModel, jacobian: ca.SX) -> ca.SX:
 
 
 def _limited(model: RobotModel, q: ca.SX, step: ca.SX) -> ca.SX:
-    """Return q after a step of the six joints, shortened to `MAX_JOINT_STEP`."""
+    """Return the joints q after a step of the six joints, shortened such that no joint moves more
+    than `MAX_JOINT_STEP`."""
     largest = ca.norm_inf(step)
     # At a singular posture the step is not a number: stay, and let the residual tell.
     usable = ca.norm_1(step) < 1e9
@@ -460,7 +463,8 @@ def _others(joints: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _minors(rows: ca.SX) -> dict[tuple[int, ...], ca.SX]:
-    """Compute the determinants of all 3 by 3 parts of (3, 6) rows, by their columns."""
+    """Compute the determinants of all 3 by 3 submatrices of rows (3, 6), by the indices of their
+    columns."""
     pairs = {
         (i, j): rows[1, i] * rows[2, j] - rows[1, j] * rows[2, i]
         for i, j in combinations(range(6), 2)

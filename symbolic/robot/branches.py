@@ -1,9 +1,9 @@
-"""Every inverse-kinematics branch of an arm at a pose, and the ranking of start branches.
+"""All inverse-kinematics branches of an arm at a pose, and the ranking of start branches.
 
-Six joints reach a pose in up to sixteen ways; an arm's redundant joints are where the hand-made
-trajectory has them at the start. No closed form covers every arm (the GoFa's
-wrist is offset), so Newton's method is run from a low-discrepancy set of starts over the whole
-joint range, all at once, and the distinct solutions are collected; each one's residual is checked.
+Six joints reach a pose in up to sixteen ways; an arm's redundant joints have the values of the
+hand-made trajectory at the start. No closed form covers every arm (the GoFa's wrist is offset). So
+Newton's method runs from a low-discrepancy set of starts over the whole joint range, all at once,
+and the distinct solutions are collected. The residual of each is checked.
 """
 
 from __future__ import annotations
@@ -26,40 +26,40 @@ from symbolic.robot.arm import TRACK_OUTPUTS, follow_function, following_columns
 from symbolic.robot.model import RobotModel
 
 N_STARTS = 1024
-"""Starts of the search."""
+"""Number of starts of the search."""
 
 SPREAD_ROOT = 1.1127756842787055
-"""The root of x^7 = x + 1: multiples of its powers fill six dimensions evenly (Roberts)."""
+"""The root of x^7 = x + 1. Multiples of its powers fill six dimensions evenly (Roberts)."""
 
 MOST_STEPS, STEPS = 80, 4
-"""Newton steps from each start, and how many are made at once."""
+"""Largest number of Newton steps from each start, and number of steps made at once."""
 
 SOLUTION_TOLERANCE = 1e-10
 """Largest pose residual of a solution [m, rad]."""
 
 BRANCH_TOLERANCE = 1e-4
-"""Solutions closer than this in every joint are one [rad]."""
+"""Solutions that differ less than this in every joint count as one [rad]."""
 
 IK_STEP_LIMIT = 0.4
 """Largest change of a joint in one step of the search [rad]."""
 
 ROBUST_CLEARANCE = 0.02
-"""Clearance above which more of it does not make a branch better [m]."""
+"""Clearance beyond this does not make a branch better [m]."""
 
 
 @dataclass(frozen=True, eq=False)
 class StartBranch:
-    """A start posture of one arm, and the figures of its motion along the hand-made trajectory.
+    """A start posture of one arm, and figures of the arm's motion along the hand-made trajectory.
 
     Attributes:
         q: (n,) joint positions at the first waypoint [rad].
-        kept: samples of the hand-made trajectory that are reached, within limits and away from
-            singularities, counted until the first that is not.
-        clearance: least clearance bound of this arm along that trajectory [m]; infinite where
-            no bound is given.
-        limit_margin: least distance to a joint limit along it [rad].
-        manipulability: least |det J| along it [m^3].
-        path: (samples, n), the joint path along it [rad].
+        kept: number of samples of the hand-made trajectory before the first one that is not
+            reached, beyond a joint limit or near a singularity.
+        clearance: least clearance bound of this arm along the trajectory [m]; infinite if no bound
+            is computed.
+        limit_margin: least distance to a joint limit along the trajectory [rad].
+        manipulability: least |det J| along the trajectory [m^3].
+        path: (samples, n) joints along the trajectory [rad].
     """
 
     q: Array
@@ -71,40 +71,43 @@ class StartBranch:
 
     @property
     def rank(self) -> tuple[float, ...]:
-        """Sort key, smaller is better: samples kept, then clearance, then margins.
+        """Sort key, smaller is better: number of samples kept, then clearance, then margins.
 
-        Clearance beyond `ROBUST_CLEARANCE` counts no more. The last key is the distance to the
-        nearest limit in radians times the manipulability: both have to be large.
+        Clearance beyond `ROBUST_CLEARANCE` does not count. The last entry is the distance to the
+        nearest limit times the manipulability, since both should be large.
         """
         robust = min(self.clearance, ROBUST_CLEARANCE)
         return (-float(self.kept), -round(robust, 4), -self.limit_margin * self.manipulability)
 
 
 Approach = Callable[[Array, Array, Array], Mapping[str, Array]]
-"""Joints (n, joints), the transpose of the wanted rotation (3, 3) and the position (3,) to the
-outputs (n, ...) of `approach_function`."""
+"""Function from joints (n, joints), the transposed rotation (3, 3) and the position (3,) of the
+wanted flange placement to the outputs (n, ...) of `approach_function`."""
 
 Follow = Callable[[Array, Array], Mapping[str, Array]]
-"""Joints (m, joints) at the first of some extended poses (n, 6 + k) to `TRACK_OUTPUTS` (m, n, ...)
-of an arm without load."""
+"""Function from joints (m, joints) at the first of n extended poses (n, 6 + k) to the
+`TRACK_OUTPUTS` (m, n, ...) of an arm without load."""
 
 Poses = Callable[[Array], Array]
-"""Extended waypoints (w, 6 + k) to all samples (n, 6 + k) of the path through them."""
+"""Function from extended waypoints (w, 6 + k) to the extended poses (n, 6 + k) at all samples of
+the path through them."""
 
 Clearance = Callable[[Array, Array], float]
-"""Box poses (n, 6) and joints (n, joints) to an arm's least clearance bound [m]."""
+"""Function from box poses (n, 6) and joints (n, joints) of an arm to the arm's least clearance
+bound [m]."""
 
 
 @dataclass(frozen=True)
 class ArmSearch:
-    """Functions with which start branches of an arm are found.
+    """Functions that the search for an arm's start branches uses.
 
     Attributes:
         approach: function of Newton steps towards a flange placement (type `Approach`).
         follow: function of the arm's motion along extended poses (type `Follow`).
         poses: function from waypoints to all samples of the path (type `Poses`).
         clearance: function of the arm's least clearance bound [m]; None for no bound.
-        found: postures (m, n) by what they were searched for, which others look up.
+        found: cache of postures (m, n), keyed by the searched flange placement and redundant
+            joints.
     """
 
     approach: Approach
@@ -117,7 +120,7 @@ class ArmSearch:
 def interpreted_search(
     workcell: Workcell, arm: int, model: RobotModel, clearance: Clearance | None = None
 ) -> ArmSearch:
-    """Build the search of an arm's start branches with CasADi's interpreter."""
+    """Build the functions of the search for an arm's start branches with CasADi's interpreter."""
     track = follow_function(
         workcell.robots[arm], model, workcell.contacts[arm], workcell.task.samples, "follow"
     )
@@ -138,7 +141,7 @@ def interpreted_search(
 
 
 def interpreted_approach(model: RobotModel) -> Approach:
-    """Build an arm's `approach_function` with CasADi's interpreter."""
+    """Build the function of type `Approach` of an arm with CasADi's interpreter."""
     function = approach_function(model, "approach")
 
     def approach(q: Array, rotation: Array, position: Array) -> Mapping[str, Array]:
@@ -153,9 +156,9 @@ def interpreted_approach(model: RobotModel) -> Approach:
 def approach_function(model: RobotModel, name: str) -> ca.Function:
     """Build the function of damped Newton steps towards a placement of the flange.
 
-    Inputs: q (n,) [rad, or m where a joint slides]; rotation (3, 3) and position (3,) wanted of the
+    Inputs: q (n,) [rad, or m for a sliding joint]; wanted rotation (3, 3) and position (3,) of the
     flange in the root. Outputs: reached (n,), joints before the last step; residual, the pose
-    residual there [m, rad]; next (n,), joints after it.
+    residual of these joints [m, rad]; next (n,), joints after the last step.
     """
     q, R, p = ca.SX.sym("q", model.n_joints), ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3)
     rotation, position, jacobian = model.kinematics(q)
@@ -191,7 +194,8 @@ def inverse_kinematics(
     redundant: Mapping[int, float] = MappingProxyType({}),
     approach: Approach | None = None,
 ) -> Array:
-    """Find the joint positions of a flange pose, full turns of a joint counted once.
+    """Find all joint positions of a flange pose. Positions that differ by full turns of a joint
+    count as one.
 
     Args:
         T_root_flange: (4, 4) wanted flange placement in the robot's root frame.
@@ -200,9 +204,9 @@ def inverse_kinematics(
         approach: the arm's approach function; None for CasADi's interpreter.
 
     Returns:
-        (m, n) [rad], sorted lexicographically, each with a residual below `SOLUTION_TOLERANCE`
-        and each joint on the turn that is nearest the middle of its range; postures with a joint
-        that no turn brings within its limits are left out.
+        (m, n) [rad] sorted lexicographically, each with a residual below `SOLUTION_TOLERANCE`. Each
+        joint is on the turn nearest the middle of its range. Postures with a joint beyond its
+        limits on every turn are left out.
     """
     approach = approach or interpreted_approach(model)
     following = list(model.following)
@@ -235,7 +239,7 @@ def _spread(count: int) -> Array:
 
 
 def _distinct(q: Array) -> Array:
-    """Return the rows that differ from all earlier ones by more than rounding, modulo full
+    """Return the rows that differ from all earlier rows by more than `BRANCH_TOLERANCE`, up to full
     turns."""
     kept = []
     while len(q):
@@ -257,10 +261,10 @@ def _central_turns(robot: Robot, model: RobotModel, least: Array, greatest: Arra
 def start_branches(
     workcell: Workcell, arm: int, model: RobotModel, search: ArmSearch | None = None
 ) -> tuple[StartBranch, ...]:
-    """Return all branches of one arm at the first waypoint, best first (see `StartBranch.rank`).
+    """Return all branches of one arm at the first waypoint, best first by `StartBranch.rank`.
 
-    Each branch is followed along the hand-made initial trajectory; a joint that may turn more
-    than once starts on the turn that keeps it farthest from its limits there.
+    Each branch is followed along the hand-made trajectory. A joint with a range of more than one
+    turn starts on the turn that keeps it farthest from its limits.
 
     Args:
         arm: index of the arm, 0 or 1.

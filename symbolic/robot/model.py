@@ -1,8 +1,8 @@
 """One arm as symbolic kinematics and dynamics, from its URDF through Pinocchio.
 
-Frames: "root" is the URDF's root link, which stands at `Robot.T_world_base`; the "flange" is the
-URDF frame that the tool is mounted on. Everything here is expressed in the root; gravity is
-turned into it, so that a tilted or hanging arm gets its true torques.
+Frames: "root" is the URDF's root link, which is at `Robot.T_world_base`; the "flange" is the URDF
+frame on which the tool is mounted. Everything is expressed in the root. Gravity is rotated into it,
+so a tilted or hanging arm has correct torques.
 """
 
 from __future__ import annotations
@@ -23,24 +23,25 @@ from symbolic.robot import bridge
 
 @dataclass(frozen=True, eq=False)
 class RobotModel:
-    """An arm's numeric model and, built on first use, its CasADi functions.
+    """An arm's numeric model, and its CasADi functions, which are built on first use.
 
     The functions are `casadi.Function` objects over SX with dense outputs; call them on SX, MX or
-    numbers. q (n,) [rad, or m where a joint slides], v (n,) and a (n,) its time derivatives.
+    numbers. q (n,) are joint positions [rad, or m for a sliding joint], v (n,) and a (n,) their
+    time derivatives.
 
-    What an arm follows is the extended pose (6 + m,): the box pose, then the values of the cell's m
-    redundant joints (`symbolic.records.RedundantJoint`). The arm's own redundant joints
-    are where it says; the other six follow the box.
+    An arm follows the extended pose (6 + m,): the box pose, then the values of the cell's m
+    redundant joints (`symbolic.records.RedundantJoint`). The extended pose sets the arm's redundant
+    joints; the other six joints follow the box.
 
     Attributes:
         name: the robot's name in the workcell.
         model: Pinocchio's numeric model with the locked joints removed; not to be modified. Its
             gravity is expressed in the root.
         flange: name of the flange frame.
-        redundant: one pair for each redundant joint of the arm: its index in q and its index in
-            the extended pose.
-        pose_size: entries of the extended pose, 6 + m.
-        orientation: how entries 3 to 5 of the extended pose describe the rotation of the box.
+        redundant: for each redundant joint of the arm its index in q and its index in the extended
+            pose.
+        pose_size: number of entries of the extended pose, 6 + m.
+        orientation: convention of entries 3 to 5 of the extended pose, the rotation of the box.
     """
 
     name: str
@@ -68,11 +69,12 @@ class RobotModel:
 
     @cached_property
     def turning(self) -> tuple[bool, ...]:
-        """True per revolute joint, False per prismatic one."""
+        """For each joint True if it is revolute, False if it is prismatic."""
         return turning_joints(self.model)
 
     def with_redundant(self, q: Expression, extended: Expression) -> Expression:
-        """Return the joints (n,) with redundant ones replaced by those of the extended pose."""
+        """Return the joints (n,) with the redundant ones replaced by their values in the extended
+        pose."""
         columns = dict(self.redundant)
         if not columns:
             return q
@@ -135,7 +137,7 @@ def build_robot_model(
 
     Args:
         robot: the arm.
-        redundant, pose_size, orientation: see `RobotModel`; `symbolic.records.Task` gives
+        redundant, pose_size, orientation: attributes of `RobotModel`; `symbolic.records.Task` has
             them.
 
     Raises:

@@ -1,9 +1,9 @@
 """Limited quantities at a point of a driven path, with exact derivatives, for the polish of
 drivable carries.
 
-Path and timing are variables together: at a point of the path every limited quantity follows from
-the box pose, its first and second derivative along the path, the joints that hold the box there,
-u'' and u'^2. Joints are differentiated as in `symbolic.smooth.places`.
+Path and timing are variables together. At a point of the path every limited quantity follows from
+the box pose, its first and second derivative along the path, the joints that hold the box at this
+pose, u'' and u'^2. Joints are differentiated as in `symbolic.smooth.places`.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from symbolic.limits import LIMITS, BlockLayout, limit_layout
 from symbolic.records import Workcell
 
 DRIVEN_FIRST, DRIVEN_SECOND = "driven_first", "driven_second"
-"""Names of the functions."""
+"""Names of the two functions of `driven_functions`."""
 
 
 @dataclass(frozen=True)
@@ -37,9 +37,9 @@ class DrivenLayout(BlockLayout):
     """Layout of the quantities at a driven point in their vector.
 
     Attributes:
-        pose: entries of the extended pose.
-        by_program: whether a program finds the forces: then the vector has the load in their place,
-            and neither torque nor pressure.
+        pose: number of entries of the extended pose.
+        by_program: True if a program computes the forces. The vector then has the load in place of
+            force, torque and pressure.
     """
 
     pose: int
@@ -47,32 +47,33 @@ class DrivenLayout(BlockLayout):
 
     @property
     def variables(self) -> int:
-        """Return the number of variables: extended pose and both derivatives, the joints, u'' and
-        u'^2."""
+        """Number of variables: extended pose and both derivatives, the joints, u'' and u'^2."""
         return 3 * self.pose + self.joints + 2
 
 
 def driven_layout(workcell: Workcell) -> DrivenLayout:
-    """Return the layout for a workcell's arms: a block for each block of `LIMITS`, and the load.
+    """Return the layout of the limited quantities of a workcell: a block for each block of
+    `LIMITS`, and the load.
 
     Blocks, in order:
 
-    speed (joints + 2): squared speeds over their squared limits: joints, payload, its rotation.
+    speed (joints + 2): squared speeds over their squared limits, of the joints, the payload and its
+    rotation.
 
-    acceleration (joints): of the joints over their limits, signed.
+    acceleration (joints): joint accelerations over their limits, signed.
 
-    cone (2): squared length of the payload's acceleration and angular acceleration, likewise.
+    cone (2): squared lengths of the payload's acceleration and angular acceleration over their
+    squared limits.
 
     force (2): normal component and tangential magnitude of the required force, from which the
-    paper's normal forces follow (`planned_branches`), or both normal forces of soft fingers [N].
+    paper's normal forces follow (`planned_branches`); for soft fingers both normal forces [N].
 
-    torque (joints): over their limits, signed.
+    torque (joints): joint torques over their limits, signed.
 
     pressure (2): shifts of the centres of pressure over their patches' radii.
 
-    load (6): force and moment that the pads have to balance, see
-    `symbolic.contact.grasp.grasp_wrenches` [N, N m]; in place of force, torque and pressure if a
-    program finds the forces.
+    load (6): force and moment that the pads have to balance, about the box frame's origin [N, N m];
+    in place of force, torque and pressure if a program computes the forces.
     """
     joints, by_program = limit_layout(workcell).joints, not contact_model(workcell).has_closed_form
     entries = {"joint": joints, "payload": 1, "robot": 2}
@@ -86,8 +87,8 @@ def driven_layout(workcell: Workcell) -> DrivenLayout:
 
 
 def planned_branches(workcell: Workcell) -> Array:
-    """Return the branches of both planned normal forces as sums of a point's quantities (2,
-    branches, quantities); none if a program finds the forces."""
+    """Return the branches of both planned normal forces as linear combinations (2, branches,
+    quantities) of a point's quantities. There are none if a program computes the forces."""
     layout, own = driven_layout(workcell), contact_model(workcell).force_branches
     if layout.by_program:
         return np.zeros((2, 0, layout.size))
@@ -97,8 +98,8 @@ def planned_branches(workcell: Workcell) -> Array:
 
 
 def driven_functions(model: CellModel) -> dict[str, ca.Function]:
-    """Return limited quantities at a driven point, with y = (pose, first, second, q_1, q_2, a, w),
-    a = u'' and w = u'^2:
+    """Build the functions of the limited quantities at a driven point, by name. With y = (pose,
+    first, second, q_1, q_2, a, w), a = u'' and w = u'^2:
 
     driven_first: parts of y -> value (size,), slope (size, variables).
 
@@ -127,7 +128,7 @@ def driven_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def _value(model: CellModel, inputs: list[ca.SX], implicit: ImplicitVariables) -> ca.SX:
-    """Return the quantities of `driven_layout`."""
+    """Return the quantities of `driven_layout` at a point."""
     workcell = model.workcell
     limits, joints = limit_layout(workcell), limit_layout(workcell).joints
     *path, a, w = inputs

@@ -26,23 +26,23 @@ from symbolic.geometry.clearance import BOX_NUMBERS
 from symbolic.smooth.places import PathConstraint, PathPointSymbols
 
 GAPS = "gaps"
-"""Name of `gap_function`."""
+"""Name of the function of `gap_function`."""
 
 PARALLEL_SINE = 0.1
-"""Sine of the angle between two edges below which their cross product is no separating
+"""If the sine of the angle between two edges is smaller, their cross product is no separating
 direction."""
 
 PARALLEL_GAP = -1e3
-"""Gap along such a direction: it never is the largest [m]."""
+"""Gap along such a direction [m]. It is so small that it never is the largest."""
 
 
 DIRECTION_NUMBERS = 12
-"""Length of `direction_numbers`."""
+"""Number of entries of `direction_numbers`."""
 
 
 def _directions() -> Array:
-    """Return coefficients (SEPARATING_DIRECTIONS, DIRECTION_NUMBERS) of the axes; see
-    `direction`."""
+    """Return the coefficients (SEPARATING_DIRECTIONS, DIRECTION_NUMBERS) of all separating
+    directions, as `direction` takes them."""
     found = []
     for first, axes in ((0, 1), (3, 1), (6, 3)):
         for k in range(3):
@@ -60,13 +60,13 @@ def _directions() -> Array:
 _SHARES = _directions()
 
 SEPARATING_DIRECTIONS = len(_SHARES)
-"""Both signs of three axes of the obstacle, three of the payload, and the cross products of each
-edge of one and each of the other: one of these separates two disjoint boxes."""
+"""Number of separating directions: both signs of three axes of the obstacle, of three axes of the
+payload, and of the cross products of their edges. One of these separates two disjoint boxes."""
 
 
 def direction_numbers(obstacle: Array, k: int) -> Array:
-    """Return the parameters (DIRECTION_NUMBERS,) of direction k from an obstacle (BOX_NUMBERS,),
-    for `direction`."""
+    """Return the coefficients (DIRECTION_NUMBERS,) of direction k of an obstacle (BOX_NUMBERS,), as
+    `direction` takes them."""
     along_obstacle, along_payload, edge, other = _SHARES[k].reshape(4, 3)
     rotation = obstacle[:9].reshape(3, 3)
     turned = rotation @ along_obstacle, rotation @ edge
@@ -74,11 +74,14 @@ def direction_numbers(obstacle: Array, k: int) -> Array:
 
 
 def direction(place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-    """Return a direction (3,), not normalised: the sum of a fixed vector, one of the payload, and
-    the cross product of a fixed edge and one of the payload. All but one are zero.
+    """Return a direction (3,), not normalised, as the sum of three terms of which one is nonzero: a
+    fixed vector, a vector of the payload, and the cross product of a fixed edge and an edge of the
+    payload.
 
     Args:
-        numbers: (DIRECTION_NUMBERS,) these four, two in the world and two in the payload's axes.
+        place: symbols of the place.
+        numbers: (DIRECTION_NUMBERS,) these four vectors, the fixed ones in the world frame, the
+            others in the payload's axes.
     """
     fixed, own, edge, other = ca.vertsplit(numbers, 3)
     turned = ca.mtimes(place.rotation, ca.horzcat(own, other))
@@ -86,7 +89,7 @@ def direction(place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
 
 
 def gap(place: PathPointSymbols, obstacle: ca.SX, numbers: ca.SX) -> ca.SX:
-    """Return the gap along a direction, with rounded kinks [m]."""
+    """Return the gap between payload and obstacle along a direction [m], with rounded kinks."""
     n = direction(place, numbers)
     return place.scene.separation(obstacle, n / ca.norm_2(n))
 
@@ -102,7 +105,7 @@ class SeparatingAxisGap(PathConstraint):
     scale: ClassVar[float] = 0.01
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Return the gap."""
+        """Return the gap [m]."""
         return gap(place, numbers[:BOX_NUMBERS], numbers[BOX_NUMBERS:])
 
     def count(self, place: PathPointSymbols) -> int:
@@ -128,7 +131,7 @@ class AxisSwitchGap(PathConstraint):
     moving: ClassVar[bool] = True
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Return the height at which the lines of both gaps meet."""
+        """Return the height at which the lines of both gaps meet [m]."""
         obstacle, both = (
             numbers[:BOX_NUMBERS],
             ca.vertsplit(numbers[BOX_NUMBERS:], DIRECTION_NUMBERS),
@@ -149,11 +152,11 @@ class AxisSwitchGap(PathConstraint):
 
 
 def gap_function(place: PathPointSymbols) -> ca.Function:
-    """Return pose (6,), obstacle (BOX_NUMBERS,) -> gaps (SEPARATING_DIRECTIONS,) along single
-    directions, with sharp kinks [m].
+    """Build the function from pose (6,) and obstacle (BOX_NUMBERS,) to gaps
+    (SEPARATING_DIRECTIONS,) [m] along single directions, with sharp kinks.
 
-    The largest is positive if the payload, a box, and the obstacle are disjoint, and never above
-    their distance then; except for nearly parallel edges.
+    The largest gap is positive if the payload, a box, and the obstacle are disjoint, except for
+    nearly parallel edges. It never exceeds their distance.
     """
     obstacle = ca.SX.sym("obstacle", BOX_NUMBERS)
     rotation = ca.reshape(obstacle[:9], 3, 3).T

@@ -1,15 +1,16 @@
 """Rows at places of the path: their constraints, and joints that follow the box.
 
-A row is one value above a required one. The value depends on the box pose, where the separating
-direction changes (`symbolic.smooth.passage`) also on the pose's rate along the path, and on the
-joints that hold the box there. With the closure F(pose, q) = 0, the joints follow the pose by the
-implicit function theorem, and a row c(pose, q) has the derivatives
+A row is a value that has to exceed a required value. The value depends on the box pose at the place
+and on the joints that hold the box; where the separating direction changes
+(`symbolic.smooth.passage`) also on the rate of the pose along the path. With the closure F(pose, q)
+= 0, the joints follow the pose by the implicit function theorem, and a row c(pose, q) has the
+derivatives
 
     dq/dpose = -F_q^-1 F_pose,     nu = -F_q^-T c_q,     T = [I; dq/dpose],
     grad = T^T c_y,                Hessian = T^T (c_yy + sum_k nu_k F_k,yy) T,     y = (pose, q),
 
 where pose is the extended pose and F has as many equations as there are joints: six hold the box,
-one more ties each redundant joint to its value. They hold at a solution of F only: no derivative
+and one more sets each redundant joint. The derivatives are valid at a solution of F only. None
 passes through Newton's steps, so the joints have to be accurate, not differentiable.
 """
 
@@ -38,32 +39,32 @@ from symbolic.robot.arm import (
 )
 
 Order = Literal["first", "second"]
-"""Values with their first derivatives, or weighted second derivatives."""
+"""'first': values with their first derivatives. 'second': weighted second derivatives."""
 
 ORDERS: tuple[Order, ...] = ("first", "second")
 
 Side = Literal["lower", "upper"]
 
 SOLVE_STEPS = 5
-"""Newton steps from the reference joints, which the solver renews in every iteration."""
+"""Number of Newton steps from the reference joints, which the solver renews in every iteration."""
 
 KINK_WIDTH = 2e-4
 """Width of the smoothed kinks of clearances [m]; measured distances correct the smooth bounds
 (`hybrid_opt.polishing.constraints`)."""
 
 PARALLEL_WIDTH = 3e-3
-"""Width of the kinks where a face of a box becomes parallel to another [1]: the best carries lie in
-these kinks, and a solver makes little progress along sharp ones."""
+"""Width of the smoothed kinks where a face of a box becomes parallel to another face [1]. The best
+carries lie in these kinks, and a solver makes little progress along sharp ones."""
 
 
 class PathPointSymbols:
-    """Symbols of one place, and expressions that are built from them once.
+    """Symbols of one place of the path, and expressions of them that are built once.
 
     Attributes:
         model: arms and bodies of the cell.
-        pose: pose (6,) of the box [m, rad].
-        rate: derivative (6,) of the pose with respect to the path parameter.
-        q: joint positions (n,) of each arm [rad].
+        pose: (6,) pose of the box [m, rad].
+        rate: (6,) derivative of the pose by the path parameter.
+        q: (n,) joint positions of each arm [rad].
     """
 
     def __init__(self, model: CellBodies) -> None:
@@ -74,17 +75,17 @@ class PathPointSymbols:
 
     @cached_property
     def rotation(self) -> ca.SX:
-        """Return the rotation (3, 3) of the box in the world."""
+        """The rotation (3, 3) of the box in the world."""
         return rotation_matrix(self.model.workcell.task.orientation, self.pose[3:])
 
     @cached_property
     def scene(self) -> DistanceBounds:
-        """Return the bodies, with rounded kinks of their distances."""
+        """Distance bounds of all bodies, with rounded kinks."""
         return self._scene(Softness(KINK_WIDTH, PARALLEL_WIDTH))
 
     @cached_property
     def sharp_scene(self) -> DistanceBounds:
-        """Return the bodies with exact distances."""
+        """Distance bounds of all bodies, exact."""
         return self._scene(EXACT)
 
     def _scene(self, softness: Softness) -> DistanceBounds:
@@ -93,26 +94,27 @@ class PathPointSymbols:
         return DistanceBounds(self.model.screen, *at, softness)
 
     def obstacle(self, pair: int) -> Array:
-        """Return the parameters of the box of a separable pair."""
+        """Return the parameters (BOX_NUMBERS,) of the box of a separable pair."""
         geometry = self.model.geometry
         return box_numbers(geometry.bodies[geometry.active[pair].second])
 
     def separable(self) -> tuple[int, ...]:
-        """Return the active pairs of the payload and an obstacle of one box."""
+        """Return the active pairs of the payload and an obstacle that is a single box."""
         columns = enumerate(self.model.geometry.columns.tolist())
         return tuple(pair for pair, column in columns if self.scene.separable(column))
 
 
 @dataclass(frozen=True)
 class PathConstraint(ABC):
-    """One constraint at a place.
+    """One constraint at a place of the path.
 
-    Constraints of one family share their functions and differ by the parameters of these.
+    Constraints of one family share their compiled functions and differ only by the parameters of
+    these functions.
 
     Attributes:
-        scale: divisor of the value, so that 1 is significant [m, rad, 1]: in metres a solver would
-            neglect a centimetre.
-        moving: whether the value depends on the rate.
+        scale: divisor of the value, chosen so that 1 is significant [m, rad, 1]. In metres a solver
+            would neglect a centimetre.
+        moving: whether the value depends on the rate of the pose.
     """
 
     scale: ClassVar[float]
@@ -121,14 +123,14 @@ class PathConstraint(ABC):
     @property
     @abstractmethod
     def family(self) -> str:
-        """Return the name of the constraints that share their functions."""
+        """Name shared by the constraints that use the same functions."""
 
     @abstractmethod
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Return the value, by the parameters (n,) of a member of the family."""
+        """Return the value at a place, given the parameters (n,) of a member of the family."""
 
     def count(self, place: PathPointSymbols) -> int:
-        """Count the parameters of the family's functions."""
+        """Return the number of parameters of a member of the family."""
         return 0
 
     def numbers(self, place: PathPointSymbols) -> Array:
@@ -140,7 +142,8 @@ class PathConstraint(ABC):
         return ()
 
     def given(self, model: CellBodies) -> dict[str, ca.SX]:
-        """Return the cell's parameters in the value: by default those of its bodies."""
+        """Return the cell's parameters on which the value depends, by group; by default those of
+        its bodies."""
         return sx_parameters(model.screen)
 
 
@@ -160,11 +163,11 @@ class Clearance(PathConstraint):
 
     @property
     def family(self) -> str:
-        """Return the family of this pair alone."""
+        """Name of the family, which has this pair as its only member."""
         return f"clearance_{self.column}"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Return the bound of `symbolic.geometry.clearance`, with rounded kinks."""
+        """Return the lower bound of the distance [m], with rounded kinks."""
         return place.scene.bound(self.column)
 
     def arms(self, model: CellBodies) -> tuple[int, ...]:
@@ -187,19 +190,19 @@ class JointLimit(PathConstraint):
 
     @property
     def family(self) -> str:
-        """Return the family of all limits of one arm."""
+        """Name of the family of all joint limits of one arm."""
         return f"joint_limit_{self.arm + 1}"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Return the margin, negative beyond the limit."""
+        """Return the margin [rad], negative beyond the limit."""
         return numbers[0] + ca.dot(numbers[1:], place.q[self.arm])
 
     def count(self, place: PathPointSymbols) -> int:
-        """Count a margin, and a slope per joint."""
+        """Return the number of parameters: a margin, and one slope per joint."""
         return 1 + int(place.q[self.arm].numel())
 
     def numbers(self, place: PathPointSymbols) -> Array:
-        """Return the margin at zero joints, and its gradient."""
+        """Return the margin at zero joints, then its gradient by the joints."""
         robot = place.model.workcell.robots[self.arm]
         slope = np.zeros(robot.position_lower.shape[0])
         slope[self.joint] = 1.0 if self.side == "lower" else -1.0
@@ -217,10 +220,10 @@ class JointLimit(PathConstraint):
 
 @dataclass(frozen=True, order=True)
 class ManipulabilityLimit(PathConstraint):
-    """(|det J| / least)^2 - 1 of an arm.
+    """Value (|det J| / least)^2 - 1 of an arm, with the least allowed |det J|.
 
-    The square matters: at the edge of the reach the determinant falls like a root of the distance,
-    its square linearly.
+    At the edge of the reach the determinant falls like a root of the distance; its square falls
+    linearly.
     """
 
     arm: int
@@ -229,11 +232,11 @@ class ManipulabilityLimit(PathConstraint):
 
     @property
     def family(self) -> str:
-        """Return the family of this arm alone."""
+        """Name of the family, which has this arm as its only member."""
         return f"reach_{self.arm + 1}"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Return the value, zero at the least manipulability of the workcell."""
+        """Return the value, which is zero at the least manipulability of the workcell."""
         least = place.model.workcell.robots[self.arm].min_manipulability
         model = place.model.robots[self.arm]
         jacobian = following_columns(model, model.jacobian(place.q[self.arm]))
@@ -249,19 +252,20 @@ class ManipulabilityLimit(PathConstraint):
 
 
 def row_name(family: str, order: Order) -> str:
-    """Return the name of a `row_function`."""
+    """Return the name of the function that `row_function` builds for a family."""
     return f"row_{family}_{order}"
 
 
 def closure_name(arm: int, order: Order) -> str:
-    """Return the name of one of `closure_functions`."""
+    """Return the name of the function that `closure_functions` builds for an arm."""
     return f"closure_{arm + 1}_{order}"
 
 
 def row_function(place: PathPointSymbols, constraint: PathConstraint, order: Order) -> ca.Function:
-    """Return the value and gradient, or the Hessian, of a constraint's family by its variables.
+    """Build the function of the value and gradient, or of the Hessian, of a family of constraints.
 
-    With y = pose, then the rate if it is `moving`, then the joints of its `arms`:
+    The variables y are the pose, then the rate if the constraint is `moving`, then the joints of
+    its `arms`.
 
     first: pose, rate, q_1, q_2, numbers -> value, gradient (n_y,).
 
@@ -287,7 +291,8 @@ def row_function(place: PathPointSymbols, constraint: PathConstraint, order: Ord
 
 
 def closure_functions(model: CellModel, arm: int) -> dict[str, ca.Function]:
-    """Return an arm's joints by the box pose, and the matrices for derivatives of rows.
+    """Build the functions of an arm's joints by the box pose, and of the matrices for derivatives
+    of rows.
 
     first: pose (6 + m,), q_reference (n,) -> q (n,) that hold the box; follow dq/dpose (n, 6 + m);
     pull -F_q^-1 (n, n), so that nu = pull^T c_q.

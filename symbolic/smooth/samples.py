@@ -1,17 +1,17 @@
 """Forces and pressure at samples, with exact derivatives.
 
-In the paper's model all normal forces are the largest of functions that are linear in the
-normal component F_n and the tangential magnitude F_t of the required force
-(`symbolic.contact.paper.normal_force_branches`), so that these two, and not the kinked forces, are
-differentiated; those of soft fingers are differentiated themselves. The share of each patch that
-the shift of the centre of pressure leaves is differentiated directly: its kinks are those of the
-forces. Where a program finds the forces, the load is differentiated here, and the forces by the
-load in `grasp_force_functions`.
+In the paper's model each normal force is the largest of several linear functions of the normal
+component F_n and the tangential magnitude F_t of the required force
+(`symbolic.contact.paper.normal_force_branches`). So F_n and F_t are differentiated, and not the
+kinked forces. Forces of soft fingers are smooth and are differentiated themselves. The remaining
+share of each patch is differentiated directly: its kinks are those of the forces. If a program
+computes the forces, the load is differentiated here, and the forces by the load in
+`grasp_force_functions`.
 
-With the constant-speed law the motion at a sample depends on a window of five neighbouring samples
-alone (two finite differences). One small function serves all inner samples, with its window's basis
-rows as an argument; the first two and the last two samples, with their one-sided differences, have
-one function per end. Any other time law is differentiated as a whole.
+With the constant-speed law the motion at a sample depends only on a window of five neighbouring
+samples (two finite differences). One small function serves all inner samples and takes the basis
+rows of its window as an argument. The first two and the last two samples have one-sided differences
+and one function per end. Other time laws are differentiated as a whole.
 """
 
 from __future__ import annotations
@@ -45,38 +45,39 @@ from symbolic.records.task import Task
 from symbolic.smooth.places import ORDERS, Order
 
 Quantity = Literal["force", "pressure", "load"]
-"""force: components of the normal forces, see `_force_function` [N]. pressure: 1 - (shift / patch
-radius)^2 of contacts 1 and 2. load: force and moment about the box frame's origin, along the box's
-axes [N, N m]."""
+"""'force': quantities from which the normal forces follow (`ContactModel.force_quantities`) [N].
+'pressure': 1 - (shift / patch radius)^2 of contacts 1 and 2. 'load': force and moment about the box
+frame's origin, along the box's axes [N, N m]."""
 
 QUANTITY_WIDTHS: Mapping[Quantity, int] = {"force": 2, "pressure": 2, "load": 6}
-"""Values per sample."""
+"""Number of values per sample of each quantity."""
 
 Block = Literal["inner", "first", "last", "path"]
-"""Inner samples, one per call; the first two; the last two; all samples of another time law."""
+"""'inner': inner samples, one per call. 'first', 'last': the first two and the last two samples.
+'path': all samples together, for other time laws."""
 
 SAMPLE_BARRIER_WEIGHT = 1e-4
-"""Weight of the program's barriers; see `symbolic.contact.soft_grasp`. Forces exceed the
-least ones by a share of about this times the number of active constraints, which the polish
-corrects at every iterate."""
+"""Weight of the program's barriers in `symbolic.contact.soft_grasp`. Forces exceed the least forces
+by a share of about this times the number of active constraints; the polish corrects this at every
+iterate."""
 
 INPUTS = ("x", "basis", "rounding")
-"""Inputs of every function of samples."""
+"""Names of the inputs of every function of samples."""
 
 MOTION_INPUTS = ("pose", "rate", "second_rate")
-"""Motion of the box at a sample, (6,) each."""
+"""Names of the inputs that describe the motion of the box at a sample, (6,) each."""
 
 DIFFERENCE_WINDOW = 5
-"""Samples on which the motion at one sample depends with the constant-speed law."""
+"""Number of samples on which the motion at one sample depends with the constant-speed law."""
 
 
 def sample_name(quantity: Quantity, block: Block, order: Order) -> str:
-    """Return the name of a function of `sample_functions`."""
+    """Return the name of the function that `sample_functions` builds for a block."""
     return f"{quantity}_{block}_{order}"
 
 
 def grasp_force_name(order: Order) -> str:
-    """Return the name of a function of `grasp_force_functions`."""
+    """Return the name of the function that `grasp_force_functions` builds."""
     return f"held_{order}"
 
 
@@ -86,7 +87,7 @@ class SampleBlock:
 
     Attributes:
         block: name of the function's block.
-        samples: (calls, k) the k samples of each call.
+        samples: (calls, k) indices of the k samples of each call.
         basis: (calls, width, n_waypoints) basis rows of each call's window.
     """
 
@@ -96,7 +97,7 @@ class SampleBlock:
 
 
 def sample_blocks(task: Task) -> tuple[SampleBlock, ...]:
-    """Divide the task's samples among functions."""
+    """Divide the task's samples into blocks, one for each function."""
     n, position = task.samples, sample_basis(task).position
     if not task.law.has_differences:
         return (SampleBlock("path", np.arange(n)[None, :], position[None]),)
@@ -112,11 +113,11 @@ def sample_blocks(task: Task) -> tuple[SampleBlock, ...]:
 
 
 def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[str, ca.Function]:
-    """Return values of each sample, w = QUANTITY_WIDTHS[quantity], and their derivatives, for every
-    block of `sample_blocks`.
+    """Build the functions of a quantity at samples and of its derivatives, by name, for every block
+    of `sample_blocks`. There are w = QUANTITY_WIDTHS[quantity] values per sample.
 
-    For a block of k samples, with x (n_var,), basis (n_waypoints, width) of the window and rounding
-    (see `timed_path`), the latter two without effect if the block is the whole path:
+    Inputs of a block of k samples: x (n_var,), basis (n_waypoints, width) of the window, and the
+    rounding of `timed_path`. The latter two have no effect if the block is the whole path.
 
     first: x, basis, rounding -> values (w k,), all of the first sample, all of the second, ..., and
     gradient (n_var, w k), one column per value.
@@ -124,8 +125,8 @@ def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[str, ca.Fun
     second: x, basis, rounding, weight (w k,), along (n_var,) -> curvature (n_var,), the Hessian of
     weight . values times along.
 
-    With one direction per call the code of second derivatives is a tenth as long as a whole
-    Hessian's: lanes evaluate its columns side by side, and it stays in the processor's cache.
+    With one direction per call the code of second derivatives is a tenth as long as for a whole
+    Hessian. Lanes evaluate the columns side by side, and the code stays in the processor's cache.
     """
     makers = {"force": _force_function, "pressure": _margin_function, "load": _load_function}
     sample = makers[quantity](workcell)
@@ -141,8 +142,8 @@ def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[str, ca.Fun
 def grasp_force_functions(
     workcell: Workcell, weight: float = SAMPLE_BARRIER_WEIGHT
 ) -> dict[str, ca.Function]:
-    """Return normal forces without closed form as smooth convex functions of a sample's load, at a
-    weight of the barriers; see `symbolic.contact.soft_grasp.SoftGrasp.first` and `second`:
+    """Build the functions of normal forces without closed form, which are smooth convex functions
+    of a sample's load at a weight of the barriers (`symbolic.contact.soft_grasp`), by name:
 
     first: load (6,) -> normal (2,) [N], slope (6, 2), state (n,) for the second.
 
@@ -156,8 +157,9 @@ def grasp_force_functions(
 
 
 def motion_function(task: Task) -> ca.Function:
-    """Return x (n_var,) -> motion (n, 18), box pose, rate and second rate at every sample, and
-    slope (18 n, n_var), of its entries row by row; NumPy shapes."""
+    """Build the function from x (n_var,) to motion (n, 18), the box pose, rate and second rate at
+    every sample, and slope (18 n, n_var), the derivatives of its entries row by row. Shapes are
+    NumPy's."""
     x = ca.MX.sym("x", task.n_var)
     path = timed_path(task, sample_basis(task), waypoint_matrix(task, x))
     motion = ca.vertcat(path.pose, path.rate, path.second_rate)
@@ -218,8 +220,10 @@ def _at_samples(
     """Evaluate a function of the motion at the chosen columns of the timed path.
 
     Args:
-        along: basis, waypoints and rounding of `timed_path`.
-        handed: parameters of task and payload.
+        of_motion: function of the motion at one sample.
+        along: basis, waypoints and rounding for `timed_path`.
+        columns: indices of the samples.
+        handed: parameters of task and payload as inputs.
     """
     path, at = (
         timed_path(workcell.task, *along, select_parameters(handed, workcell.task)),
@@ -231,8 +235,8 @@ def _at_samples(
 
 
 def _wrench_function(workcell: Workcell) -> ca.Function:
-    """Return pose, rate, second_rate (6,) of a sample -> required force and moment (6,) about the
-    centre of mass, in the box frame [N, N m]."""
+    """Build the function from pose, rate and second_rate (6,) of a sample to the required force and
+    moment (6,) about the centre of mass, in the box frame [N, N m]."""
     payload = workcell.payload
     pose, rate, second = motion = [ca.SX.sym(name, 6) for name in MOTION_INPUTS]
     centre = number(payload.centre_of_mass)
@@ -242,7 +246,8 @@ def _wrench_function(workcell: Workcell) -> ca.Function:
 
 
 def _margin_function(workcell: Workcell) -> ca.Function:
-    """Return force and moment (6,) in the box frame -> 1 - (shift / patch radius)^2 (2,)."""
+    """Build the function from force and moment (6,) in the box frame to 1 - (shift / patch
+    radius)^2 (2,)."""
     wrench, contacts = ca.SX.sym("wrench", 6), workcell.contacts
     shift = contact_model(workcell).hold(_contact_load(workcell, wrench))
     squares = ca.vertcat(*map(ca.sumsqr, shift.shifts))
@@ -252,8 +257,8 @@ def _margin_function(workcell: Workcell) -> ca.Function:
 
 
 def _load_function(workcell: Workcell) -> ca.Function:
-    """Return force and moment (6,) about the centre of mass -> those about the box frame's
-    origin."""
+    """Build the function from force and moment (6,) about the centre of mass to force and moment
+    about the box frame's origin."""
     wrench, centre = ca.SX.sym("wrench", 6), number(workcell.payload.centre_of_mass)
     about = wrench[3:] + ca.cross(ca.SX(centre), wrench[:3])
     given = sx_parameters(workcell.payload).values()
@@ -261,8 +266,8 @@ def _load_function(workcell: Workcell) -> ca.Function:
 
 
 def _force_function(workcell: Workcell) -> ca.Function:
-    """Return force and moment (6,) in the box frame -> the two quantities whose linear branches are
-    the normal forces (`ContactModel.force_quantities`)."""
+    """Build the function from force and moment (6,) in the box frame to the quantities (2,) of
+    `ContactModel.force_quantities`, whose linear branches are the normal forces."""
     wrench, model = ca.SX.sym("wrench", 6), contact_model(workcell)
     load = _contact_load(workcell, wrench)
     quantities = model.force_quantities(load, model.hold(load))
@@ -271,7 +276,7 @@ def _force_function(workcell: Workcell) -> ca.Function:
 
 
 def _contact_load(workcell: Workcell, wrench: ca.SX) -> ContactLoad:
-    """Return the contact load of a force and moment (6,) in the box frame."""
+    """Return the contact load that corresponds to a force and moment (6,) in the box frame."""
     contacts, centre = workcell.contacts, workcell.payload.centre_of_mass
     first, second = (ca.SX(number(c.T_box_pad[:3, 3] - centre)) for c in contacts)
     axes = ca.SX(number(contacts[0].T_box_pad[:3, :3]))

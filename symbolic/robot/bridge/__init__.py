@@ -38,10 +38,11 @@ def frame_kinematics(model: pinocchio.Model, frame: int) -> casadi.Function:
 
 
 def frame_drift(model: pinocchio.Model, frame: int) -> casadi.Function:
-    """Return the part dJ/dt v of a frame's acceleration, caused by the joint velocities alone.
+    """Build the function of the part dJ/dt v of a frame's acceleration, which the joint velocities
+    alone cause.
 
-    q (nq,), v (nv,) -> drift (6,): linear [m/s^2] then angular [rad/s^2], along the root's axes,
-    so that the frame's classical acceleration is jacobian @ a + drift.
+    q (nq,), v (nv,) -> drift (6,): linear [m/s^2] then angular [rad/s^2], along the root's axes.
+    The frame's classical acceleration is jacobian @ a + drift.
     """
     return _function(_extension().frame_drift(model.saveToString(), frame))
 
@@ -63,13 +64,13 @@ def inverse_dynamics(model: pinocchio.Model) -> casadi.Function:
 
 
 def require_same_minor(built: dict[str, str], installed: dict[str, str]) -> None:
-    """Refuse versions that differ in major or minor number.
+    """Check that versions agree in major and minor number.
 
     Args:
-        built, installed: library name -> version.
+        built, installed: versions by library name.
 
     Raises:
-        BridgeError: naming every library that differs.
+        BridgeError: versions differ; the message names every such library.
     """
     different = [
         f"{library} {installed[library]} is installed, {version} was compiled against"
@@ -99,7 +100,7 @@ def _extension() -> ModuleType:
 
 
 def _function(serialised: str) -> casadi.Function:
-    """Return the function, sharing terms that Pinocchio's algorithms compute twice."""
+    """Restore a serialised function, sharing terms that Pinocchio's algorithms compute twice."""
     function = casadi.Function.deserialize(serialised)
     inputs = function.sx_in()
     outputs = casadi.cse(function.call(inputs))
