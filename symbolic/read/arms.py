@@ -1,13 +1,15 @@
-"""Arms in robot descriptions: chains of joints, Pinocchio models, and which arm models which link.
+"""Arms in robot descriptions: chains of joints, Pinocchio models, and the links that belong to each
+arm.
 
 A serial arm of six joints or more is picked from a description (`symbolic.read.urdf`); every other
 joint is held.
 
-Two robots of a workcell that name one description at one place are the two arms of one machine.
-Every link is then modelled once: behind an arm's first moving joint it belongs to that arm, what
-a joint of both moves (a lift, a torso) to the first, and what neither moves stands still for both.
+Two robots of a workcell with the same description at the same place are the two arms of one
+machine. Every link is then modelled once. Behind an arm's first moving joint it belongs to this
+arm. A link that a common joint (a lift, a torso) moves belongs to the first arm. A link that
+neither arm moves is fixed for both.
 
-A description that holds no such arm is a `RobotModelError`.
+A description without such an arm raises a `RobotModelError`.
 """
 
 from __future__ import annotations
@@ -30,14 +32,14 @@ from symbolic.records import PAYLOAD_NAME, Robot, Workcell
 from symbolic.records.problems import matching, suggestion
 
 Positions = tuple[tuple[str, float], ...]
-"""Names of joints and where they stand [rad or m]."""
+"""Names of joints with their positions [rad or m]."""
 
 
 def chain_joints(urdf: Urdf, root: str, tip: str) -> tuple[str, ...]:
     """Return the moving joints between two links, from the root to the tip.
 
     Raises:
-        RobotModelError: a link does not exist, or the tip does not hang on the root.
+        RobotModelError: a link does not exist, or the tip does not descend from the root.
     """
     links = urdf.links
     for link in (root, tip):
@@ -59,19 +61,19 @@ def chain_joints(urdf: Urdf, root: str, tip: str) -> tuple[str, ...]:
 
 
 def held_joints(urdf: Urdf, moving: Sequence[str], locked: Positions) -> Positions:
-    """Return every joint of a description that does not move, with its held position.
+    """Return every joint of a description that is held, with its position.
 
-    That is the one of `locked`, else zero or the nearest that its limits allow; a joint that
-    mimics another stands where that one puts it.
+    The position is the one in `locked`, else zero or the limit closest to zero. A joint that mimics
+    a held joint has the position that follows.
 
     Args:
         urdf: the description.
         moving: joints that move.
-        locked: joints and positions that the user gives [rad or m].
+        locked: joints that the user holds, with their positions [rad or m].
 
     Raises:
-        RobotModelError: a locked joint does not exist, or a joint mimics one that moves and bears
-            a shape or a mass.
+        RobotModelError: a locked joint does not exist, a joint of the chain mimics another joint,
+            or a joint with a shape or mass behind it mimics a moving joint.
     """
     given = dict(locked)
     free = [name for name, joint in urdf.joints.items() if joint.kind != "fixed"]
@@ -110,7 +112,7 @@ def held_joints(urdf: Urdf, moving: Sequence[str], locked: Positions) -> Positio
 
 
 class RobotModelWarning(DualArmWarning):
-    """A part of a description is left out."""
+    """Warning that a part of a description is left out."""
 
 
 @cache
@@ -137,15 +139,15 @@ def _mass(link: ElementTree.Element) -> float:
 
 
 def without_links(urdf: Urdf, patterns: tuple[str, ...]) -> Urdf:
-    """Return a description without some links, without what hangs on them and the joints that move
-    them.
+    """Return a description without some links, without all links behind them, and without the
+    joints that move these.
 
     Args:
         urdf: the description.
         patterns: names of links, or patterns with `*` and `?`.
 
     Raises:
-        RobotModelError: a pattern matches no link, or every link would go.
+        RobotModelError: a pattern matches no link, or no link would be left.
     """
     dropped: set[str] = set()
     for pattern in patterns:
@@ -194,7 +196,7 @@ def listed(names: Sequence[str], most: int = 20) -> str:
 
 
 FOLLOWING = 6
-"""Joints that follow the box; what an arm has beyond them is redundant."""
+"""Number of joints that follow the box. Further joints of an arm are redundant."""
 
 
 def robot_urdf(robot: Robot) -> Urdf:
@@ -208,8 +210,8 @@ def reduced_model(urdf: Urdf, held: Positions = ()) -> pin.Model:
 
     Args:
         urdf: the robot's description.
-        held: names of joints and the positions they are held at [rad or m]; a joint of several
-            axes is always held at its neutral position.
+        held: names of held joints with their positions [rad or m]. A joint with several axes is
+            always held at its neutral position.
 
     Raises:
         RobotModelError: Pinocchio refuses the description.
@@ -244,9 +246,9 @@ def moving_joints(urdf: Urdf, chain_root: str, flange: str, locked: Positions) -
 
     Args:
         urdf: the robot's description.
-        chain_root: link that the chain begins at; '' for all joints that are not locked.
-        flange: link that the chain ends at.
-        locked: joints that the user holds, with their positions.
+        chain_root: link at which the chain begins; '' for all joints that are not locked.
+        flange: link at which the chain ends.
+        locked: joints that the user holds, with their positions [rad or m].
     """
     if chain_root:
         found = chain_joints(urdf, chain_root, flange)
@@ -262,11 +264,11 @@ def moving_joints(urdf: Urdf, chain_root: str, flange: str, locked: Positions) -
 
 
 def arm_model(robot: Robot) -> pin.Model:
-    """Return a robot's model: its chain of moving joints, other joints held, the tool's mass
-    included.
+    """Return a robot's Pinocchio model: its chain of moving joints, with all other joints held and
+    the tool's mass included.
 
     Raises:
-        RobotModelError: it is not a serial arm with that flange.
+        RobotModelError: the robot is not a serial arm with its flange.
     """
     urdf = robot_urdf(robot)
     moving = moving_joints(urdf, robot.chain_root, robot.flange, robot.locked_joints)
@@ -284,20 +286,19 @@ def arm_model(robot: Robot) -> pin.Model:
 
 @lru_cache(maxsize=16)
 def _problems(kinematics: str, file: str, held: Positions, flange: str) -> tuple[str, ...]:
-    """List the reasons why a description is not an arm with that flange."""
+    """List the reasons why a description is not a serial arm with this flange."""
     model = _reduced(kinematics, file, held)
     found = structure_problem(model), flange_problem(model, flange)
     return tuple(problem for problem in found if problem)
 
 
 def turning_joints(model: pin.Model) -> tuple[bool, ...]:
-    """Return, per joint in the order of q, True for a revolute joint and False for a prismatic
-    one."""
+    """Return for each joint in the order of q True if it is revolute, False if it is prismatic."""
     return tuple(str(joint.shortname()).startswith("JointModelR") for joint in model.joints[1:])
 
 
 def structure_problem(model: pin.Model) -> str:
-    """Return why a model is not a serial arm of at least six joints, or an empty string."""
+    """Return why a model is not a serial arm of at least six joints; '' if it is."""
     names = list(model.names)[1:]
     if len(names) < FOLLOWING:
         return (
@@ -320,7 +321,7 @@ def structure_problem(model: pin.Model) -> str:
 
 
 def flange_problem(model: pin.Model, flange: str) -> str:
-    """Return why a frame cannot carry the tool, or an empty string."""
+    """Return why a frame cannot carry the tool; '' if it can."""
     bodies = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
     tip = model.njoints - 1
     last = [x for x in bodies if model.frames[link_frame(model, x)].parentJoint == tip]
@@ -338,23 +339,23 @@ def link_frame(model: pin.Model, link: str) -> int:
 
 
 def link_lengths(model: pin.Model, flange: str) -> Array:
-    """Compute the distances (n,) from each joint of an arm to the next one, the last to the flange
-    [m]."""
+    """Compute the distances (n,) [m] from each joint of an arm to the next, and from the last joint
+    to the flange."""
     offsets = [model.jointPlacements[joint].translation for joint in range(2, model.njoints)]
     offsets.append(model.frames[link_frame(model, flange)].placement.translation)
     return np.asarray(np.linalg.norm(offsets, axis=1))
 
 
 MANIPULABILITY_SHARE = 1e-3
-"""Default of `min_manipulability` over the cube of an arm's length: 2 to 24 % of random postures of
-thirteen arms of 0.74 to 1.75 m are below it, 6 % of a GoFa 12's."""
+"""Default of `min_manipulability` over the cube of an arm's length. 2 to 24 % of random postures of
+thirteen arms of 0.74 to 1.75 m are below it, 6 % for a GoFa 12."""
 
 
 def usual_manipulability(model: pin.Model, flange: str) -> float:
     """Compute the default of `min_manipulability` [m^3], to two digits.
 
-    It scales with the cube of the arm's length, as abs(det J) does. The length is that of the last
-    seven joints: what moves a whole arm, such as a lift, is not part of it.
+    The default scales with the cube of the arm's length, as |det J| does. The length covers the
+    last seven joints. Joints that move the whole arm, such as a lift, are not part of it.
     """
     length = float(link_lengths(model, flange)[-FOLLOWING - 1 :].sum())
     return float(f"{MANIPULABILITY_SHARE * length**3:.1e}")
@@ -368,14 +369,14 @@ Arms = tuple[Robot, Robot]
 
 @dataclass(frozen=True)
 class ArmLinks:
-    """Links with collision shapes that are modelled as one arm's, in the order of its file.
+    """Links with collision shapes that are modelled with one arm, in the order of the file.
 
     Attributes:
-        moved: links behind the arm's first moving joint; those that only common joints move are
+        moved: links behind the arm's first moving joint. Links that only common joints move are
             listed with the first arm alone.
-        still: links that stand still, listed with one arm only.
-        mount: the last link with shapes before those of `moved` on the way to the flange: one that
-            stands still, or of the second arm one that common joints move; '' if there is none.
+        still: links that do not move, listed with one arm only.
+        mount: last link with shapes before the links of `moved` on the way to the flange. It is
+            fixed, or, for the second arm, moved by common joints; '' if there is none.
     """
 
     moved: tuple[str, ...]
@@ -396,7 +397,7 @@ def one_machine(robots: Arms) -> bool:
 
 
 def arm_links(robots: Arms, i: int) -> ArmLinks:
-    """Return the links that are modelled as arm i's (0 or 1)."""
+    """Return the links that are modelled with arm i (0 or 1)."""
     carried = _carriers(robots[i])
     still = [link for link in carried if carried[link] == UNMOVED]
     moved = [link for link in carried if carried[link] != UNMOVED]
@@ -412,7 +413,7 @@ def arm_links(robots: Arms, i: int) -> ArmLinks:
 
 
 UNMOVED = "universe"
-"""What Pinocchio calls the joint that everything stands on."""
+"""Pinocchio's name of the joint to which everything fixed belongs."""
 
 
 def common_joints(robots: Arms) -> tuple[str, ...]:
@@ -425,7 +426,7 @@ def common_joints(robots: Arms) -> tuple[str, ...]:
 
 
 def machine_problem(robots: Arms) -> str:
-    """Return why two robots cannot be the arms of one machine, or an empty string."""
+    """Return why two robots cannot be the arms of one machine; '' if they can."""
     if not one_machine(robots):
         return ""
     chains, held = [], []
@@ -467,8 +468,8 @@ def _is_behind(urdf: Urdf, link: str, joints: Collection[str]) -> bool:
 
 
 def _carriers(robot: Robot) -> dict[str, str]:
-    """Return the last arm joint before each link with shapes; 'universe' for a link that stands
-    still."""
+    """Return the last arm joint before each link with shapes; 'universe' for a link that does not
+    move."""
     model = arm_model(robot)
     links = robot_urdf(robot).collisions
     return {link: model.names[model.frames[link_frame(model, link)].parentJoint] for link in links}
@@ -485,11 +486,11 @@ def _mount(robot: Robot, still: Collection[str]) -> str:
 
 
 def body_names(workcell: Workcell) -> dict[str, tuple[str, ...]]:
-    """Return the names by which collision pairs are addressed, per owner.
+    """Return the names by which collision pairs are addressed, by owner: `payload`, `environment`
+    or a robot's name.
 
-    The payload is `payload`, an environment body has its own name, a link or tool body of a
-    robot is `ROBOT/NAME`; what stands still of a machine with both arms bears the name of the
-    first. The keys are `payload`, `environment` and the robots' names.
+    The payload is `payload`, an environment body has its own name, a link or tool body of a robot
+    is `ROBOT/NAME`. Fixed links of a machine with both arms have the name of the first robot.
     """
     names = {
         PAYLOAD_NAME: (PAYLOAD_NAME,),

@@ -1,5 +1,5 @@
-"""Read a workcell from a TOML file, as written or with changed values. docs/reference/workcell.md
-describes every key. Names, references, reach and other conditions on several sections are
+"""Read a workcell from a TOML file, unchanged or with changed values. docs/reference/workcell.md
+describes every key. Names, references, reach and other conditions that involve several sections are
 checked last."""
 
 from __future__ import annotations
@@ -64,12 +64,12 @@ def load(
         path: the file; every path inside it is relative to its folder.
         checks: further checks of an otherwise valid workcell, e.g. inverse kinematics at the
             start; each yields its problems as `key.path: what was found; what is allowed`.
-        stored: whether the workcell was unpacked from an archive. If so, missing packages are not
-            looked for on this machine, and xacro files were expanded before.
-        decided: per robot the start branch that takes the place of "search" in the file.
-        text: what to read in the place of the file's content, as if it stood there.
-        reach: whether fixed poses have to be within the arms' reach; False where spins of pads or
-            bases are still to be chosen.
+        stored: whether the workcell was unpacked from an archive. Missing packages are then not
+            looked for on this machine, and xacro files are already expanded.
+        decided: for each robot the start branch that replaces "search" in the file.
+        text: content to read in place of the file's content; None for the file's content.
+        reach: whether fixed poses have to be within the arms' reach; False if bases or rotations of
+            pads are still to be chosen.
 
     Raises:
         WorkcellError: with all problems of the file, each with its key path.
@@ -98,12 +98,12 @@ def changed(workcell: Workcell, changes: Mapping[str, Any]) -> Workcell:
     """Return the workcell with changed values of some keys of its file, checked like a file.
 
     Args:
-        workcell: read from a file.
-        changes: values by key path, see `symbolic.read.cell.changed_text`.
+        workcell: a workcell that was read from a file.
+        changes: values by key path, such as 'payload.mass' (`changed_text` describes paths).
 
     Raises:
-        WorkcellError: a path leads nowhere, or the changed cell is wrong; the message lists every
-            problem.
+        WorkcellError: a path does not exist, or the changed cell is invalid. The message lists
+            every problem.
     """
     source, text = workcell.source, workcell.text
     try:
@@ -178,12 +178,12 @@ def _build(
 def _digest(content: bytes, workcell: Workcell) -> str:
     """Compute the SHA-256 of a workcell file and of the content of every file it names.
 
-    Where the files stand does not matter, only what is in them: the file's own bytes, per robot
-    its URDF (a xacro file as it expands), the meshes the URDF names and its SRDF, and the meshes
-    of tools, environment and payload, in order.
+    Only the content of the files counts, not their place: the bytes of the workcell file; for each
+    robot its URDF (a xacro file in expanded form), the meshes that the URDF names, and its SRDF;
+    then the meshes of tools, environment and payload, in order.
 
     Raises:
-        OutsideError: one of them cannot be read, or together they are too large.
+        OutsideError: a file cannot be read, or all together are too large.
     """
     outer = hashlib.sha256(hashlib.sha256(content).digest())
     room = safe_io.CELL_BYTES
@@ -227,10 +227,11 @@ def _content(path: Path, most: int) -> bytes:
 
 
 def with_branches(content: bytes, data: Mapping[str, Any], decided: tuple[int, int]) -> bytes:
-    """Return a workcell file's text with `start_branch = "search"` replaced by the branches found.
+    """Return the text of a workcell file with `start_branch = "search"` replaced by the chosen
+    branches.
 
     Raises:
-        SettingsError: see `symbolic.read.editing.completed`.
+        SettingsError: the file is written in a way that cannot be edited.
     """
     robots = data.get("robots")
     if not isinstance(robots, list) or len(robots) != len(decided):
@@ -262,14 +263,14 @@ def changed_text(content: bytes, changes: Mapping[str, Any], file: str) -> bytes
 
     Args:
         content: content of the workcell file.
-        changes: values by key path as in the file: 'payload.mass', 'task.goal'. An array of tables
-            is followed by an index or by a table's name, or else every table is meant:
-            'contacts[0].friction', 'contacts.friction', 'environment.top board.xyz'.
+        changes: values by key path as in the file: 'payload.mass', 'task.goal'. In an array of
+            tables an index or a name selects one table; without either, every table is meant:
+            'contacts[0].friction', 'environment.top board.xyz', 'contacts.friction'.
         file: name of the file, for messages.
 
     Raises:
-        WorkcellError: with every path that leads nowhere.
-        OutsideError: the content is no TOML.
+        WorkcellError: a path does not exist; the message lists every such path.
+        OutsideError: the content is not TOML.
     """
     data, problems = deepcopy(_tables_of(content)), []
     for path, value in changes.items():
@@ -290,13 +291,13 @@ def changed_text(content: bytes, changes: Mapping[str, Any], file: str) -> bytes
 
 @lru_cache(maxsize=4)
 def _tables_of(content: bytes) -> dict[str, Any]:
-    """Parse the tables, cached because many variants of one cell are tried; callers must not
-    modify them."""
+    """Parse the tables of a file. The result is cached, because many variants of one cell are
+    tried; callers must not modify it."""
     return safe_io.toml_tables(content)
 
 
 def _owners(table: Any, path: str) -> Iterator[tuple[dict[str, Any], str]]:
-    """Yield every table that a key path ends in, with the path's last key."""
+    """Yield every table in which a key path ends, with the last key of the path."""
     key, _, rest = path.partition(".")
     name, bracket, index = key.partition("[")
     if bracket:
@@ -314,7 +315,8 @@ def _owners(table: Any, path: str) -> Iterator[tuple[dict[str, Any], str]]:
 
 
 def _among(tables: list[dict[str, Any]], rest: str) -> Iterator[tuple[dict[str, Any], str]]:
-    """Yield the same for an array of tables, selected by index or name, or all of them."""
+    """Yield the tables of `_owners` from an array of tables, selected by index or name, or from all
+    of them."""
     if found := _INDEX.match(rest):
         k = int(found[1])
         if k < len(tables):
@@ -343,7 +345,7 @@ REACH_SLACK = 1e-6  # [m], rounding of a flange exactly at full stretch
 
 
 def check_names(workcell: Workcell, problems: Problems) -> None:
-    """Check that names are unique where they address something."""
+    """Check that names that address something are unique."""
     robots = [(f"robots[{i}].name", robot.name) for i, robot in enumerate(workcell.robots)]
     bodies = [(f"environment[{i}].name", b.name) for i, b in enumerate(workcell.environment)]
     _check_unique([("'payload' (reserved)", PAYLOAD_NAME), *robots, *bodies], problems)
@@ -380,7 +382,7 @@ def check_contacts(workcell: Workcell, problems: Problems) -> None:
 
 
 def check_uncertainty(workcell: Workcell, problems: Problems) -> None:
-    """Check that displaced pads stay on part of their patches, and that these still face each
+    """Check that displaced pads stay partly on their patches, and that the patches still face each
     other."""
     displaced = workcell.uncertainty.pad_position
     if not (displaced and workcell.uncertainty.stated) or not problems.clean(
@@ -404,8 +406,8 @@ def check_uncertainty(workcell: Workcell, problems: Problems) -> None:
 
 
 def check_shapes(workcell: Workcell, problems: Problems) -> None:
-    """Check that the shapes do not exceed the allowed convex pieces; a mesh has at least one
-    piece."""
+    """Check that the shapes do not exceed the allowed number of convex pieces. A mesh counts as at
+    least one."""
     most = workcell.collision.most_pieces
     if not problems.clean("collision.most_pieces", *_of_robots("urdf")):
         return
@@ -456,14 +458,14 @@ def _of_robots(*parts: str) -> list[str]:
 
 
 def check_machine(workcell: Workcell, problems: Problems) -> None:
-    """Check that two arms of one machine move independently and agree on the links that stand
-    still."""
+    """Check that two arms of one machine move independently and agree on the links that do not
+    move."""
     if problems.clean(*_of_robots(*ARM_KEYS)) and (problem := machine_problem(workcell.robots)):
         problems.add("robots[1].chain", problem)
 
 
 def check_speeds(workcell: Workcell, problems: Problems) -> None:
-    """Check that the reference speeds are within the payload's own limits."""
+    """Check that the reference speeds are within the payload's limits."""
     for key, limit_key in (
         ("reference_speed", "velocity_max"),
         ("reference_angular_speed", "angular_velocity_max"),
@@ -479,7 +481,7 @@ def check_speeds(workcell: Workcell, problems: Problems) -> None:
 def check_reach(workcell: Workcell, problems: Problems) -> None:
     """Check that no fixed pose is farther away than the stretched length of an arm.
 
-    This is necessary, not sufficient: it costs no inverse kinematics.
+    The check is necessary, not sufficient: it needs no inverse kinematics.
     """
     poses = [(path, pose) for path, pose in _fixed_poses(workcell) if problems.clean(path)]
     for index, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
@@ -506,8 +508,8 @@ def check_reach(workcell: Workcell, problems: Problems) -> None:
 def stretched_length(robot: Robot) -> tuple[Array, float]:
     """Return the first joint's position (3,) in the world and an upper bound of the reach [m].
 
-    The bound is the sum of the distances between successive joints and the flange, and of how far
-    joints may slide.
+    The bound is the sum of the distances from joint to joint and to the flange, and of the travels
+    of sliding joints.
 
     Raises:
         RobotModelError: the robot's model is not a serial arm.
@@ -534,7 +536,8 @@ def _fixed_poses(workcell: Workcell) -> Iterator[tuple[str, Array]]:
 
 
 def check_all(workcell: Workcell, problems: Problems, reach: bool) -> None:
-    """Make every check across sections that needs no inverse kinematics; `reach` as in `load`."""
+    """Make every check across sections that needs no inverse kinematics. `reach` is the argument of
+    `load`."""
     checks: tuple[Callable[[Workcell, Problems], None], ...] = (
         check_machine,
         check_shapes,

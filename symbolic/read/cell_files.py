@@ -1,11 +1,11 @@
 """A workcell file and every file it names, as one value that can be stored and unpacked.
 
-The layout keeps the file's own relative references valid, so that the workcell's digest stays
-the same. Absolute references are replaced by relative ones. Unpacking writes below one folder
-only, and refuses files that refer to anything outside it.
+The layout keeps the relative references in the file valid, so the workcell's digest stays the same.
+Absolute references are replaced by relative ones. Unpacking writes below one folder only, and
+refuses files that refer to anything outside it.
 
-The drivable variant of a cell is the same under the time law `OPTIMAL`: its file is the original's
-text with one key changed, comments and all else as they were.
+The drivable variant of a cell is the same cell under the time law `OPTIMAL`. Its file is the
+original text with one key changed; comments and everything else stay.
 """
 
 from __future__ import annotations
@@ -44,7 +44,8 @@ from symbolic.records.time_law import OPTIMAL
 MAX_FILES = 1000
 MAX_TOTAL_BYTES = safe_io.CELL_BYTES
 MAX_PLAIN_BYTES = 256 * 2**10
-"""Text up to this size is stored as it is, anything else compressed."""
+"""Text up to this size is stored uncompressed, larger text and binary content compressed
+[bytes]."""
 
 _UNSAFE = r"[\x00-\x1f\x7f/\\:]"
 
@@ -73,8 +74,8 @@ def collect_cell(workcell: Workcell) -> CellFiles:
     """Collect the files of a workcell that was read with `symbolic.read.cell.load`.
 
     Raises:
-        BundleError: the file on disk no longer describes this workcell, or a reference cannot
-            be made relative.
+        BundleError: the file no longer describes this workcell, or a reference cannot be made
+            relative.
     """
     known = workcell.source, workcell.digest, workcell.start_branch, workcell.text
     return _collected(*known)
@@ -145,7 +146,7 @@ class StoredFile:
 
 @dataclass(frozen=True)
 class StoredFiles:
-    """`CellFiles` as JSON values."""
+    """A `CellFiles` record as JSON values."""
 
     workcell: str
     digest: str
@@ -154,7 +155,7 @@ class StoredFiles:
 
 
 def cell_to_json(stored: CellFiles) -> dict[str, Any]:
-    """Convert the files to JSON values, see `StoredFiles`."""
+    """Convert the files to the JSON values of `StoredFiles`."""
     files = [asdict(_packed(name, stored.files[name])) for name in sorted(stored.files)]
     return {
         "workcell": stored.workcell,
@@ -168,7 +169,7 @@ def cell_from_json(data: Any) -> CellFiles:
     """Read the files from JSON values, checking every field.
 
     Raises:
-        BundleError: with the field that is wrong.
+        BundleError: a field is wrong; the message names it.
     """
     try:
         stored: StoredFiles = checked(StoredFiles, data, "cell", FirstProblem())
@@ -233,7 +234,7 @@ def _is_plain(name: str) -> bool:
 
 
 def _check_references(stored: CellFiles, root: Path) -> None:
-    """Refuse a workcell or URDF that refers to anything outside the stored files."""
+    """Check that no workcell file or URDF refers to anything outside the stored files."""
     base = posixpath.dirname(stored.workcell)
     for reference, package_dirs in references(parse_toml(stored.files[stored.workcell])):
         target = joined(base, reference)
@@ -268,7 +269,8 @@ def _check_references(stored: CellFiles, root: Path) -> None:
 
 
 class CellCollector:
-    """Collect a workcell's files and assign each a place relative to the workcell file."""
+    """Collector of a workcell's files that assigns each file a path relative to the workcell
+    file."""
 
     def __init__(self, source: Path, text: bytes | None = None) -> None:
         self._source = source
@@ -282,7 +284,7 @@ class CellCollector:
         """Add every file that the workcell names.
 
         Raises:
-            BundleError: a file cannot be read, or the workcell's text not be changed.
+            BundleError: a file cannot be read, or the workcell's text cannot be changed.
         """
         self._text = with_branches(self._text, parse_toml(self._text), workcell.start_branch)
         stated = parse_toml(self._text)
@@ -310,7 +312,7 @@ class CellCollector:
             self._text = completed(safe_io.text(self._text), stated, changes).encode()
 
     def layout(self) -> tuple[str, dict[str, bytes], tuple[str, ...]]:
-        """Return everything collected, moved so that no path leads upwards.
+        """Return all collected files, with paths moved such that none leads upwards.
 
         Returns:
             The path of the workcell file, the content of every file by path, and the package
@@ -346,7 +348,7 @@ class CellCollector:
         return f"embedded/{self._moved}/{name or 'folder'}"
 
     def _with_meshes(self, robot: Robot, place: str, packages: list[tuple[Path, str]]) -> bytes:
-        """Add the meshes of a URDF; return its content with this machine's addresses replaced."""
+        """Add the meshes of a URDF. Return its content with absolute addresses replaced."""
         path = robot.urdf
         with _as_bundle_errors():
             content = description_content(path, robot.xacro_arguments, robot.package_dirs)
@@ -387,7 +389,7 @@ def _content(path: Path, most: int) -> bytes:
 
 @contextmanager
 def _as_bundle_errors(subject: str = "") -> Iterator[None]:
-    """Raise errors of other modules as a `BundleError` about `subject`."""
+    """Convert errors of other modules to a `BundleError` about `subject`."""
     try:
         yield
     except DualArmError as error:
@@ -414,14 +416,15 @@ def parse_toml(content: bytes) -> dict[str, Any]:
     """Parse the tables of a workcell file.
 
     Raises:
-        BundleError: it is not TOML.
+        BundleError: the content is not TOML.
     """
     with _as_bundle_errors("the stored workcell:"):
         return safe_io.toml_tables(content)
 
 
 def references(data: Mapping[str, Any]) -> Iterator[tuple[str, list[str] | None]]:
-    """Yield the files that a workcell names: the reference and, for a URDF, its package folders.
+    """Yield every file that a workcell names: the reference and, for a URDF, its package folders,
+    else None.
 
     Raises:
         BundleError: a key is missing or has another type.

@@ -3,11 +3,11 @@
 Packages are looked up in given folders, above the description, where ROS's environment variables
 point, and beside the installed Python packages.
 
-xacro expands its macros itself, in a process of its own: `python -m symbolic.read.descriptions`. It
-evaluates Python expressions and calls macros as often as the file likes, so the process gets so
-much time and memory and no more, writes no file and starts nothing. A request goes in as JSON, an
-answer comes out. The package `xacrodoc`, which wraps xacro, was looked at and left: it keeps one
-list of packages per process, and loses the folder that relative includes are relative to.
+The package xacro expands macros in a separate process: `python -m symbolic.read.descriptions`.
+Expansion evaluates Python expressions and calls macros as often as the file asks for. So the
+process has limits on time and memory, writes no file and starts no other process. It reads a
+request as JSON and answers as JSON. The package `xacrodoc`, which wraps xacro, is not used: it
+keeps one list of packages per process, and loses the folder to which relative includes refer.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ from symbolic.errors import OutsideError
 
 PACKAGE_SCHEME = "package://"
 DEEPEST_PACKAGE = 4
-"""How far below a folder of ROS_PACKAGE_PATH a package may lie."""
+"""Number of levels below a folder of ROS_PACKAGE_PATH within which a package is looked for."""
 
 LONGEST_NAME = 200
 
 RELATIVE = ("./", "../")
-"""Begin of a xacro argument that is a path relative to the workcell file."""
+"""Beginnings of a xacro argument that mark a path relative to the workcell file."""
 
 _PACKAGE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]*")
 _PACKAGE = re.compile(rb"<name>\s*([^<\s]+)\s*</name>")
@@ -49,15 +49,15 @@ _SKIPPED = ("build", "devel", "install", "log")
 def find_package(name: str, package_dirs: Sequence[Path], description: Path) -> Path | None:
     """Return the folder of a package, or None if there is none.
 
-    In this order: in one of `package_dirs`; a folder NAME above the description; `share/NAME` below
-    each prefix of AMENT_PREFIX_PATH; in or at most `DEEPEST_PACKAGE` levels below a folder of
-    ROS_PACKAGE_PATH; `share/NAME` of the Python environment and of the prefix that wheels of
-    robotics libraries share in it (`cmeel.prefix`). A folder of another name counts in the first
-    and the second if its package.xml says NAME.
+    The package NAME is looked for in this order: in one of `package_dirs`; as a folder NAME above
+    the description; as `share/NAME` below each prefix of AMENT_PREFIX_PATH; in a folder of
+    ROS_PACKAGE_PATH or at most `DEEPEST_PACKAGE` levels below it; as `share/NAME` of the Python
+    environment, and of the prefix in it that wheels of robotics libraries share (`cmeel.prefix`).
+    In the first two places a folder with another name counts too if its package.xml says NAME.
 
     Args:
-        name: the package.
-        package_dirs: the folders that a workcell names.
+        name: name of the package.
+        package_dirs: folders of packages that the workcell names.
         description: the file that names the package.
     """
     if len(name) > LONGEST_NAME or not _PACKAGE_NAME.fullmatch(name):
@@ -84,7 +84,8 @@ def _packages(name: str, package_dirs: Sequence[Path], description: Path) -> Ite
 
 
 def package_in(folder: Path, name: str) -> Path | None:
-    """Return the subfolder called `name`, else one whose package.xml has that name, else None."""
+    """Return the subfolder called `name`, else a subfolder whose package.xml has this name, else
+    None."""
     if os.path.isdir(folder / name):
         return folder / name
     try:
@@ -95,7 +96,7 @@ def package_in(folder: Path, name: str) -> Path | None:
 
 
 def _package_name(folder: Path) -> str | None:
-    """Return the name in a folder's package.xml, or None without one."""
+    """Return the name in a folder's package.xml; None if there is no such file."""
     file = folder / "package.xml"
     if not file.is_file():
         return None
@@ -109,9 +110,10 @@ def _package_name(folder: Path) -> str | None:
 def further_package_dirs(
     addresses: Iterable[str], package_dirs: Sequence[Path], description: Path
 ) -> tuple[Path, ...]:
-    """Return folders besides `package_dirs` that hold the packages of mesh addresses, each once.
+    """Return folders outside `package_dirs` that hold the packages of mesh addresses, each folder
+    once.
 
-    A package that a given folder already holds is left out, and one that is nowhere.
+    Packages that are already in a given folder, and packages that are not found, are left out.
     """
     names = dict.fromkeys(
         address.removeprefix(PACKAGE_SCHEME).split("/", 1)[0]
@@ -128,7 +130,7 @@ def _paths(variable: str) -> Iterator[Path]:
 
 
 def _below(folder: Path, name: str, levels: int) -> Iterator[Path]:
-    """Yield folders with that name and a package.xml, in a folder or up to `levels` below it."""
+    """Yield folders with this name and a package.xml, in a folder or up to `levels` below it."""
     is_package = (folder / "package.xml").is_file()
     if folder.name == name and is_package:
         yield folder
@@ -145,8 +147,8 @@ def _below(folder: Path, name: str, levels: int) -> Iterator[Path]:
 def resolve_mesh(address: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:
     """Return the file behind a mesh address of a URDF, or None if it does not exist.
 
-    `package://NAME/REST` is looked up in the package NAME of each folder (`package_in`); `file://`
-    addresses are absolute; anything else is relative to the URDF's folder.
+    `package://NAME/REST` is looked up in the package NAME of each folder (`package_in`), `file://`
+    addresses are absolute, and other addresses are relative to the folder of the URDF.
     """
     if address.startswith(PACKAGE_SCHEME):
         name, _, rest = address.removeprefix(PACKAGE_SCHEME).partition("/")
@@ -163,10 +165,11 @@ def resolve_mesh(address: str, urdf: Path, package_dirs: Sequence[Path]) -> Path
 
 
 WAIT_SECONDS = 60.0
-"""Longest time that an expansion may take; its computing time is bounded more tightly."""
+"""Longest time to wait for an expansion [s]. Its computing time has a tighter limit."""
 
 _XACRO = re.compile(rb"xmlns:xacro\s*=")
-"""Its prefix, which is all that xacro looks at: files name its wiki in several ways."""
+"""Declaration of the xacro prefix. xacro looks at the prefix only, since files give several
+addresses."""
 _MACRO = re.compile(rb"<xacro:|\$\{|\$\(")
 _MJCF = re.compile(rb"\s*+(?:(?><\?.*?\?>|<!--.*?-->)\s*+)*+<mujoco[\s/>]", re.DOTALL)
 _PROCESS = "symbolic.read.descriptions"
@@ -178,15 +181,17 @@ Parts = tuple[tuple[str, bytes], ...]
 def description_content(
     path: Path, arguments: Arguments = (), package_dirs: Sequence[Path] = ()
 ) -> bytes:
-    """Return the URDF text of a robot's description: unchanged, expanded from xacro, or from MJCF.
+    """Return the URDF text of a robot's description: unchanged, expanded from xacro, or converted
+    from MJCF.
 
     Args:
         path: a URDF, a xacro or an MJCF file.
         arguments: values of the xacro file's arguments, by name; a plain URDF takes none.
-        package_dirs: folders of packages that `$(find NAME)` looks in first.
+        package_dirs: folders of packages in which `$(find NAME)` looks first.
 
     Raises:
-        OutsideError: it cannot be read or expanded, or not within the bounds of that process.
+        OutsideError: the file cannot be read, or cannot be expanded within the limits of time and
+            memory.
     """
     content = safe_io.read_bytes(path, safe_io.URDF_BYTES)
     if is_mjcf(content):
@@ -211,13 +216,13 @@ def description_content(
 
 
 def is_mjcf(content: bytes) -> bool:
-    """Return True if the root element is MuJoCo's."""
+    """Return True if the root element of an XML file is that of MuJoCo's format."""
     return _MJCF.match(content) is not None
 
 
 def is_xacro(content: bytes) -> bool:
-    """Return True if a description holds macros to expand; generated URDFs often keep the
-    suffix."""
+    """Return True if a description has macros to expand. The suffix does not tell, since generated
+    URDFs often keep it."""
     return _XACRO.search(content) is not None and _MACRO.search(content) is not None
 
 
@@ -228,12 +233,12 @@ _NOMINAL = re.compile(r"default_kinematics\.ya?ml$", re.IGNORECASE)
 
 
 def nominal_kinematics(content: bytes, arguments: Arguments) -> str:
-    """Return the name of a xacro file's argument for an arm's own calibration, where its value is
-    missing or the maker's nominal one; '' where there is no such argument, or a value.
+    """Return the name of a xacro file's argument for an arm's calibration, if the value is missing
+    or the maker's nominal one; '' if there is no such argument or it has a calibrated value.
 
     Args:
-        content: of the file.
-        arguments: as of `description_content`.
+        content: content of the file.
+        arguments: values of the file's arguments, by name.
     """
     given = dict(arguments)
     names = (name.decode() for name in _KINEMATICS.findall(content))
@@ -248,7 +253,7 @@ def _expanded(
 ) -> tuple[bytes | None, Parts]:
     """Return the expanded text and, for every included file, its path and digest.
 
-    The text is None where it took too long: that is remembered too, since both robots of a cell
+    The text is None if the expansion took too long. This is cached too, since both robots of a cell
     may name the file.
     """
     answer = _answer(
@@ -266,7 +271,7 @@ def _expanded(
 
 
 def _answer(request: Any) -> Any:
-    """Send a request to the expanding process; return its answer, or None after a timeout."""
+    """Send a request to the expanding process. Return its answer; None after a timeout."""
     paths = [os.path.abspath(entry) for entry in sys.path]
     with tempfile.TemporaryFile() as answer:
         try:
@@ -306,14 +311,14 @@ def _digest(path: str) -> bytes:
 
 
 CPU_SECONDS = 5
-"""Longest time that an expansion may compute."""
+"""Longest computing time of an expansion [s]."""
 
 MEMORY_BYTES = 192 * safe_io.MEBIBYTE
 MEMORY_PER_BYTE = 6
-"""Memory that it may take, and how much more per byte of the file."""
+"""Limit of memory per byte of the file, beyond a fixed amount."""
 
 ANSWER_BYTES = 8 * safe_io.URDF_BYTES
-"""Largest answer; JSON may take six bytes for a letter."""
+"""Largest size of an answer [bytes]. JSON may take six bytes for a character."""
 
 _REFUSED = ("os.", "subprocess.", "socket.", "shutil.", "ctypes.", "resource.", "signal.", "pty.")
 _LOOKING = ("os.listdir", "os.scandir", "os.walk")
@@ -340,7 +345,8 @@ def main() -> int:
 
 
 def _limit(size: int) -> None:
-    """Bound the process's remaining time, file size and memory for an input of `size` bytes."""
+    """Set limits on the process's remaining time, file size and memory for an input of `size`
+    bytes."""
     for kind, most in (
         (resource.RLIMIT_CORE, 0),
         (resource.RLIMIT_CPU, CPU_SECONDS),
@@ -354,8 +360,7 @@ def _limit(size: int) -> None:
 
 
 def _refuse_access(event: str, arguments: tuple[Any, ...]) -> None:
-    """Audit hook: let an expansion read files, and refuse everything else that its expressions
-    try."""
+    """Audit hook that lets an expansion read files and refuses every other access."""
     writes = event == "open" and isinstance(arguments[2], int) and arguments[2] & _WRITING
     if writes or (event.startswith(_REFUSED) and event not in _LOOKING):
         raise OutsideError(
@@ -396,7 +401,7 @@ def _expand(
 
 
 def _opened(name: str) -> io.StringIO:
-    """Open an included file within the size bounds; a missing file may be optional."""
+    """Open an included file within the size limits. A missing file may be optional."""
     if not os.path.exists(name):
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), name)
     try:
@@ -415,7 +420,7 @@ def _by_package(address: str, packages: Mapping[str, Path]) -> str:
 
 
 def _refusal(error: BaseException, xacro: Any) -> OutsideError:
-    """Return the refusal that an error stands for by its causes, with the file and the macro."""
+    """Return the `OutsideError` for an error of an expansion, with the file and the macro."""
     causes = [error]
     for one in causes:  # an error and those that it was made of
         inner = (getattr(one, "exc", None), one.__cause__, one.__context__)

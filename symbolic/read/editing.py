@@ -1,6 +1,7 @@
 """Changes to the text of a workcell file that keep comments and order.
 
-TOML Kit takes long to load, so that readers of cells import this module where they change a text.
+TOML Kit takes long to load, so readers of cells import this module only in functions that change a
+text.
 """
 
 from __future__ import annotations
@@ -18,23 +19,23 @@ from symbolic.errors import OutsideError, SettingsError
 from symbolic.read.descriptions import RELATIVE
 
 Changes = Mapping[str, Any]
-"""Tables and keys to be set: {'task': {'initial': ...}, 'robots': [{...}, {...}]}; a list of tables
-that is there already is changed entry by entry, a key with the value None is removed."""
+"""Tables and keys to be set: {'task': {'initial': ...}, 'robots': [{...}, {...}]}. An existing list
+of tables is changed entry by entry. A key with the value None is removed."""
 
 INLINE = ("base", "pad")
-"""Tables that are written in one line."""
+"""Names of tables that are written on one line."""
 
 
 def completed(text: str, data: Mapping[str, Any], changes: Changes) -> str:
-    """Return a workcell file's text with values set.
+    """Return the text of a workcell file with values set.
 
     Args:
-        text: the file; '' to write `data` without comments.
-        data: content of the file without the replaced values.
+        text: text of the file; '' to write `data` without comments.
+        data: parsed content of the file, without the values to be replaced.
         changes: the values to set.
 
     Raises:
-        SettingsError: the file is written in a way that cannot be completed.
+        SettingsError: the file is written in a way that cannot be edited.
     """
     wanted = merged(data, changes)
     if text and wanted == data:
@@ -47,7 +48,7 @@ def with_paths(data: Mapping[str, Any], change: Callable[[str], str]) -> Changes
 
     Args:
         data: the tables of a workcell file.
-        change: from a path, or an address of a package, to its replacement.
+        change: function from a path or a package address to its replacement.
     """
 
     def changed(table: Any, *keys: str) -> dict[str, Any]:
@@ -79,12 +80,12 @@ def extended(text: str, data: Mapping[str, Any], key: str, tables: list[dict[str
     """Return a workcell file's text with tables appended to an array, such as `[[environment]]`.
 
     Args:
-        text, data: the file, and its content.
-        key: of the array, at the top level; it may be missing.
+        text, data: text of the file, and its parsed content.
+        key: key of the array at the top level; the file may lack it.
         tables: the new tables.
 
     Raises:
-        SettingsError: see `completed`.
+        SettingsError: the file is written in a way that cannot be edited.
     """
     before = data.get(key, [])
     wanted = {**data, key: [*(before if isinstance(before, list) else ()), *tables]}
@@ -117,8 +118,7 @@ def _edited(
 
 
 def _alike(found: Any, wanted: Any) -> bool:
-    """Return True if values are equal; non-numbers such as NaN equal themselves, the reader
-    refuses them."""
+    """Return True if values are equal. NaN counts as equal to NaN; the reader refuses it later."""
     if isinstance(found, Mapping) and isinstance(wanted, Mapping):
         return found.keys() == wanted.keys() and all(_alike(found[k], wanted[k]) for k in found)
     if isinstance(found, list) and isinstance(wanted, list):
@@ -127,7 +127,8 @@ def _alike(found: Any, wanted: Any) -> bool:
 
 
 def merged(data: Any, changes: Any) -> Any:
-    """Merge changes into plain values; None removes a key. Also merges two sets of changes."""
+    """Merge changes into plain values; None removes a key. Two sets of changes can be merged
+    too."""
     if isinstance(changes, Mapping) and isinstance(data, Mapping):
         found = dict(data)
         for key, value in changes.items():
@@ -164,8 +165,8 @@ def _apply(place: Any, changes: Any) -> None:
 
 
 def _cut_heading(place: Any) -> list[Any]:
-    """Remove and return a table's trailing blank line and comments: they belong to the next table,
-    and new tables go before them."""
+    """Remove and return the blank lines and comments at the end of a table. They belong to the next
+    table, and new tables go before them."""
     body = _last_body(place)
     blank = end = len(body)
     while end and body[end - 1][0] is None:
@@ -178,8 +179,8 @@ def _cut_heading(place: Any) -> list[Any]:
 
 
 def _last_body(place: Any) -> list[Any]:
-    """Return the (key, item) pairs of a table's last part, with key None for comments and blank
-    lines; empty for an inline table or one written in several places."""
+    """Return the (key, item) pairs of a table's last part; comments and blank lines have the key
+    None. Empty for an inline table, and for a table written in several places."""
     if isinstance(place, AoT):
         return _last_body(place[-1]) if len(place) else []
     if not isinstance(place, Table | tomlkit.TOMLDocument):

@@ -24,7 +24,7 @@ _XML_NUMBER = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?
 
 
 class _LimitedBuilder(ElementTree.TreeBuilder):
-    """Build elements, with bounds on their number and depth."""
+    """Builder of XML elements with limits on their number and depth."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -46,10 +46,10 @@ class _LimitedBuilder(ElementTree.TreeBuilder):
 
 
 def parse_elements(document: str, root_tag: str = "robot") -> ElementTree.Element:
-    """Parse an XML document and return its root element, which must have the given tag.
+    """Parse an XML document and return its root element.
 
     Raises:
-        OutsideError: it is no XML, has too many elements, or another root.
+        OutsideError: the document is not XML, has too many elements, or a root with another tag.
     """
     if document.count("=") > MOST_ATTRIBUTES:
         raise OutsideError(f"has more than {MOST_ATTRIBUTES} attributes, which is the limit")
@@ -76,15 +76,15 @@ def parse_elements(document: str, root_tag: str = "robot") -> ElementTree.Elemen
 
 
 class ElementReader:
-    """One element with the words by which messages name it.
+    """Reader of one XML element that records problems with the place of the element.
 
     Attributes:
-        kept: the element with those of its attributes and inner elements that were read.
+        kept: copy of the element with only those attributes and inner elements that were read.
 
     Args:
         element: the element.
-        path: where it stands, as `link 'arm'/collision[0]`; empty for the root.
-        problems: where problems go.
+        path: place of the element, such as `link 'arm'/collision[0]`; empty for the root.
+        problems: collector of problems.
     """
 
     def __init__(self, element: ElementTree.Element, path: str, problems: Problems) -> None:
@@ -95,15 +95,15 @@ class ElementReader:
 
     @property
     def tag(self) -> str:
-        """The element's tag."""
+        """Tag of the element."""
         return self.element.tag
 
     def at(self, key: str) -> str:
-        """Return how messages name an attribute."""
+        """Return the name of an attribute for messages, with the place of the element."""
         return f"{self.path} {key}".lstrip()
 
     def named(self, tag: str) -> dict[str, ElementReader]:
-        """Return the inner elements of a tag by their names, which must be unique."""
+        """Return the inner elements with a tag by their names, which must be unique."""
         found: dict[str, ElementReader] = {}
         for index, element in enumerate(self.element.findall(tag)):
             name = ElementReader(element, f"{self.path}/{tag}[{index}]".lstrip("/"), self.problems)
@@ -120,8 +120,8 @@ class ElementReader:
         return None if element is None else self._inner(element, tag)
 
     def required(self, tag: str) -> ElementReader:
-        """Return the first inner element of a tag; a missing one is one problem and reports no
-        others."""
+        """Return the first inner element of a tag. If it is missing, record this problem and return
+        a reader that reports no others."""
         found = self.child(tag)
         if found is None:
             self.problems.add(self.path, f"<{tag}> is missing")
@@ -129,7 +129,7 @@ class ElementReader:
         return found
 
     def all(self, tag: str) -> list[ElementReader]:
-        """Return every inner element of a tag; none is added to `kept`."""
+        """Return every inner element with a tag. None of them is added to `kept`."""
         path = f"{self.path}/{tag}".removeprefix("/")
         return [
             ElementReader(element, f"{path}[{index}]", self.problems)
@@ -150,7 +150,7 @@ class ElementReader:
         return self.element.get(key)
 
     def inner_text(self, tag: str) -> str:
-        """Return the text of the first inner element of a tag, '' without one."""
+        """Return the text of the first inner element with a tag; '' if there is none."""
         return (self.element.findtext(tag) or "").strip()
 
     def text(self, key: str, most: int = MOST_NAME) -> str:

@@ -16,23 +16,24 @@ from symbolic.errors import CollisionModelError, OutsideError
 from symbolic.records.quantities import SMALLEST_SIZE
 
 FORMATS = ("stl", "dae", "obj", "ply", "off")
-"""Formats that are read: those that name no other file that matters. Lengths are metres, but for
-COLLADA (dae), which names its unit; its up axis is not turned, as in ROS."""
+"""Mesh formats that are read. None of them needs another file. Lengths are in metres, except in
+COLLADA (dae), which states its unit; as in ROS, its up axis is not rotated."""
 
 MOST_FACES = 100_000
 MOST_CELL_FACES = 200_000
-"""Most triangles of one mesh, and of all meshes of a cell together: cutting them takes about 0.1 ms
-each, and collision shapes are simplified shapes."""
+"""Largest number of triangles of one mesh, and of all meshes of a cell together. Cutting takes
+about 0.1 ms per triangle, and collision shapes are simplified shapes."""
 
 MOST_WORDS = {"obj": 2_000_000, "off": 2_000_000, "ply": 800_000}
-"""Most words of a mesh that is a text, by format: what reads them keeps them all, with 100 bytes
-each, of PLY 300. A mesh of `MOST_FACES` has fewer."""
+"""Largest number of words of a text mesh, by format. The parser keeps all words, with 100 bytes
+each, 300 for PLY. A mesh of `MOST_FACES` has fewer."""
 
 MOST_MARKS = 500_000
-"""Most elements and attributes of a COLLADA mesh."""
+"""Largest number of elements and attributes of a COLLADA mesh."""
 
 LARGEST_EXTENT = 100.0
-"""Largest extent and coordinate of a mesh [m]: more is a file in millimetres without its scale."""
+"""Largest extent and coordinate of a mesh [m]. A larger mesh is usually in millimetres without its
+scale."""
 
 
 # What it has to say is in the errors below; its log would add tracebacks on the terminal.
@@ -52,7 +53,7 @@ def read_mesh(path: Path, scale: Array) -> trimesh.Trimesh:
 
 
 def _sound(mesh: trimesh.Trimesh, scale: Array) -> trimesh.Trimesh:
-    """Scale a mesh and check that it is finite, within bounds and not flat."""
+    """Scale a mesh, and check that it is finite, within limits and not flat."""
     if not np.all(np.isfinite(mesh.vertices)):
         raise OutsideError("the mesh has vertices that are not finite numbers", code="not-finite")
     _require_few(len(mesh.faces), MOST_FACES, "triangles")
@@ -88,7 +89,7 @@ def _require_few(count: int, most: int, meaning: str) -> None:
 
 
 def _read(path: Path) -> trimesh.Trimesh:
-    """Read the triangles of a file, checking only their number of corners."""
+    """Read the triangles of a file. Only the number of corners is checked."""
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
         raise OutsideError(
@@ -128,19 +129,20 @@ def _read(path: Path) -> trimesh.Trimesh:
 
 
 def _is_text(kind: str, content: bytes) -> bool:
-    """Return True if a mesh is parsed word by word; of an STL text only the numbers are."""
+    """Return True if a mesh is parsed word by word. Of an STL text only the numbers are parsed."""
     second = content[:1000].split(b"\n", 2)[1:2]
     return kind in ("obj", "off") or (kind == "ply" and b"binary" not in b"".join(second).lower())
 
 
 def _gaps(content: bytes) -> int:
-    """Bound the number of gaps between words from above; bytes beyond ASCII may be spaces."""
+    """Compute an upper bound of the number of gaps between words. Bytes beyond ASCII may be
+    spaces."""
     letters = np.frombuffer(content, np.uint8)
     return int(np.count_nonzero((letters <= 32) | (letters >= 128)))
 
 
 def _collada_unit(mesh: trimesh.Trimesh) -> float:
-    """Return metres per unit of a COLLADA file; trimesh reports '0.01 * meters' without applying
-    it."""
+    """Return the metres per unit of a COLLADA file. trimesh reports '0.01 * meters' without
+    applying it."""
     factor, _, unit = str(mesh.units or "").partition(" * ")
     return float(factor) if unit == "meters" else 1.0

@@ -1,7 +1,8 @@
-"""MJCF, MuJoCo's robot descriptions, converted to URDF: bodies, joints, masses, limits and shapes.
+"""Conversion of MJCF, MuJoCo's robot descriptions, to URDF: bodies, joints, masses, limits and
+shapes.
 
-MuJoCo's own reader compiles the file, so includes, defaults and angles in degrees are its. What is
-written is what the compiled model holds; what URDF has no words for is refused.
+MuJoCo's own reader compiles the file, so it handles includes, defaults and angles in degrees. The
+content of the compiled model is written; content that URDF cannot express is refused.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ def compiled(path: Path) -> Any:
     """Return MuJoCo's module, the file's `MjSpec`, and its compiled model.
 
     Raises:
-        OutsideError: MuJoCo is not installed, or does not take the file.
+        OutsideError: MuJoCo is not installed, or refuses the file.
     """
     try:
         import mujoco
@@ -43,7 +44,8 @@ def compiled(path: Path) -> Any:
 def geom_shape(
     mujoco: Any, model: Any, geom: int
 ) -> tuple[str, Box | Sphere | Cylinder | Capsule | None]:
-    """Return a geom's kind, such as 'box', and its shape, or None for another kind of geom."""
+    """Return the kind of a geom, such as 'box', and its shape; None in place of a shape that is not
+    supported."""
     kind = mujoco.mjtGeom(int(model.geom_type[geom])).name[7:].lower()
     size = model.geom_size[geom]
     radius, length = float(size[0]), 2.0 * float(size[1])
@@ -60,18 +62,18 @@ def geom_shape(
 def mjcf_as_urdf(path: Path, content: bytes) -> bytes:
     """Convert a robot's MJCF to URDF: one link per body and per named site.
 
-    The world is the root link `world`. MJCF knows no velocity limits: they are zero, and a cell
-    has to give its own (`velocity_max`). Shapes that collide with nothing (contype and
-    conaffinity zero) are left out; slabs take the place of planes. A floating base, or an object
-    that lies loose in a scene, is fixed where the file has it.
+    The world is the root link `world`. MJCF has no velocity limits; they are written as zero, and a
+    cell has to state them (`velocity_max`). Shapes that collide with nothing (contype and
+    conaffinity zero) are left out; planes become slabs. A floating base, or a loose object of a
+    scene, is fixed at its place in the file.
 
     Args:
         path: the file.
-        content: its content, by which the result is remembered: files that it includes and meshes
-            count as they are when the process reads them first.
+        content: content of the file, the key under which the result is cached. Included files and
+            meshes are read once per process.
 
     Raises:
-        OutsideError: MuJoCo does not take it, or a URDF cannot express its content.
+        OutsideError: MuJoCo refuses the file, or a URDF cannot express its content.
     """
     mujoco, spec, model = compiled(path)
     if any(np.any(mesh.refpos) or abs(mesh.refquat[0]) < 1.0 for mesh in spec.meshes):
@@ -80,7 +82,7 @@ def mjcf_as_urdf(path: Path, content: bytes) -> bytes:
 
 
 class _Writer:
-    """Writer of a compiled model as URDF."""
+    """Writer of a compiled MuJoCo model as URDF."""
 
     def __init__(self, mujoco: Any, model: Any) -> None:
         self._mujoco, self._model = mujoco, model
@@ -110,7 +112,8 @@ class _Writer:
         return ElementTree.tostring(self._root)
 
     def _joints(self, body: int, name: str) -> None:
-        """Write the joints between a body and its parent, each about its own point of the body."""
+        """Write the joints between a body and its parent; each turns about its own point of the
+        body."""
         model, kinds = self._model, self._mujoco.mjtJoint
         parent = self._names[model.body_parentid[body]]
         T_parent_body = self._pose(model.body_pos[body], model.body_quat[body])
@@ -152,7 +155,8 @@ class _Writer:
         return element
 
     def _effort(self, joint: int) -> float:
-        """Return a joint's largest effort: its own bound, else its motors', else 0."""
+        """Return the largest effort of a joint [N m or N]: the joint's own limit, else that of its
+        motors, else 0."""
         model, words = self._model, self._mujoco
         if model.jnt_actfrclimited[joint]:
             return float(np.abs(model.jnt_actfrcrange[joint]).min())

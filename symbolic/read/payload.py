@@ -1,4 +1,4 @@
-"""Payload and contacts sections of a workcell file: the box, and the places of the pads on it."""
+"""Sections of a workcell file on payload and contacts: the box, and the poses of the pads on it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ PAYLOAD_KINDS = ("box", "cylinder", "mesh")
 
 
 def read_payload(table: TableReader, folder: Path) -> Payload:
-    """Read the payload; a mesh's path is relative to `folder`."""
+    """Read the payload. The path of a mesh is relative to `folder`."""
     kind = table.choice("kind", PAYLOAD_KINDS, "box")
     mass = table.number("mass", quantity.MASS)
     if kind == "mesh":
@@ -71,8 +71,8 @@ def _cylinder(table: TableReader, mass: float) -> Payload:
 
 
 def _mesh(table: TableReader, folder: Path, mass: float) -> Payload:
-    """Read a mesh payload, of uniform density within its surface, or within its hull if it has
-    holes."""
+    """Read a mesh payload with uniform density within its surface, or within its hull if the
+    surface has holes."""
     path = read_file(table, "path", folder, safe_io.MESH_BYTES)
     scale = table.vector("scale", (quantity.SCALE,) * 3, (1.0, 1.0, 1.0), filling=True)
     nothing = Payload(read_only(np.ones(3)), mass, np.zeros(3), np.eye(3))
@@ -165,8 +165,8 @@ def _read_place(
     radius: float,
     half_sides: tuple[float, float] | None,
 ) -> Array:
-    """Read T_box_pad (4, 4), on the surface or with a normal of its own; the identity after a
-    problem."""
+    """Read T_box_pad (4, 4), from a point on the surface or with an explicit normal; the identity
+    after a problem."""
     point = table.vector("xyz", (quantity.POSITION,) * 3)
     spin = table.number("spin", quantity.ANGLE, 0.0)
     written = table.vector("normal", (quantity.DIRECTION,) * 3) if table.has("normal") else None
@@ -187,15 +187,15 @@ def _read_place(
 
 
 def pad_rotation(normal: Array, spin: float) -> Array:
-    """Compute R_box_pad (3, 3) of a pad.
+    """Compute the rotation R_box_pad (3, 3) of a pad from its normal and spin.
 
-    z is the contact normal. At zero spin x points along the box's +z axis as far as it can, where
-    the normal is nearly along that, along its +x axis; y completes the right-handed frame. `spin`
-    turns the pad about its own z.
+    z is the contact normal. At zero spin x is the box's +z axis projected onto the face, or its +x
+    axis if the normal is nearly along z; y completes the right-handed frame. `spin` rotates the pad
+    about its z axis.
 
     Args:
-        normal: (3,) into the payload, of any length.
-        spin: [rad].
+        normal: (3,) direction into the payload, of any length, box frame.
+        spin: rotation about the normal [rad].
     """
     z = np.asarray(normal, dtype=float) / np.linalg.norm(normal)
     reference = np.eye(3)[0 if abs(z[2]) > ALONG_Z else 2]
@@ -217,8 +217,8 @@ def _on_surface(
 ) -> Array:
     """Compute T_box_pad (4, 4) of a pad on a face; the identity if the point is on no face.
 
-    A point of a box has three coordinates away from its middle, one of a cylinder two: across its
-    axis and along it. A face is where one of them has its largest value.
+    A point of a box has three distances from the middle, a point of a cylinder two: across the axis
+    and along it. The point is on a face if one of them has its largest value.
     """
     if isinstance(payload.shape, Mesh):
         table.add("xyz", "lies on a mesh; give the contact a normal, into the payload")

@@ -1,9 +1,9 @@
 """Robots section of a workcell file: descriptions, arms, limits, tools.
 
-Robots may be named: descriptions that Python packages hold or download. A name that ends in
-`_description` is a module of the package `robot_descriptions`, which clones the repository with the
-files when it is first asked for. Any other is a file of `example-robot-data`, whose wheel holds the
-files themselves.
+A robot may be given by a name, if a Python package has or downloads its description. A name that
+ends in `_description` is a module of the package `robot_descriptions`, which clones the repository
+with the files on first use. Any other name is a file of `example-robot-data`, whose wheel contains
+the files.
 """
 
 from __future__ import annotations
@@ -62,12 +62,12 @@ MAX_START_BRANCH = 1000
 
 
 def read_robot(table: TableReader, folder: Path, stored: bool = False) -> tuple[Robot, int]:
-    """Read one arm and the index of its start branch (-1: by criterion, -2: searched for).
+    """Read one arm and the index of its start branch (-1: best by the ranking, -2: searched for).
 
     Args:
         table: the arm's section of the workcell file.
-        folder: folder that relative paths in the section start from.
-        stored: whether the cell was unpacked from an archive, see `symbolic.read.cell.load`.
+        folder: folder to which paths in the section are relative.
+        stored: whether the cell was unpacked from an archive.
     """
     name = table.text("name")
     if "/" in name:
@@ -108,7 +108,8 @@ def read_robot(table: TableReader, folder: Path, stored: bool = False) -> tuple[
 
 
 def _read_redundant(table: TableReader, model: pin.Model | None) -> tuple[str, ...]:
-    """Read the redundant joints that the file names; () leaves the choice to the program."""
+    """Read the names of the redundant joints in the file; () if the choice is left to the
+    program."""
     names = table.texts("redundant_joints", "names of joints")
     if model is None or not names:
         return names
@@ -131,7 +132,8 @@ LIMIT_KEYS = {
     "acceleration_max": ("", quantity.ANGULAR_ACCELERATION),
     "jerk_max": ("", quantity.ANGULAR_JERK),
 }
-"""The joints' limits: what Pinocchio calls them, where a description has them, and their range."""
+"""Limits of joints by key: Pinocchio's name if descriptions have the limit, and the allowed
+range."""
 
 
 UNKNOWN_TORQUE = "unknown"
@@ -150,7 +152,7 @@ def _warn_unjudged(robot: str) -> None:
 
 
 def _read_limits(table: TableReader, model: pin.Model | None) -> dict[str, Array | None]:
-    """Read the limits (n,), from the file or else from the description."""
+    """Read the limits (n,) by key, from the file or else from the description."""
     n, found = FOLLOWING if model is None else model.nq, dict[str, Array | None]()
     for key, (own, allowed) in LIMIT_KEYS.items():
         if key == "torque_max" and table.raw(key, None) == UNKNOWN_TORQUE:
@@ -197,19 +199,19 @@ def _described_limit(table: TableReader, key: str, allowed: Range, values: Array
 
 
 MOST_FOLDERS = 100
-"""Most package folders of a robot: every mesh is looked for in each."""
+"""Largest number of package folders of a robot, since every mesh is looked for in each."""
 
 
 def _read_description(
     table: TableReader, folder: Path, stored: bool
 ) -> tuple[dict[str, Any], pin.Model | None]:
-    """Return a description as fields of `symbolic.records.Robot`, and the arm's model, None after
+    """Return a description as fields of `symbolic.records.Robot`, and the arm's model; None after
     problems.
 
     Args:
         table: the robot's section.
-        folder: folder that relative paths in the section start from.
-        stored: whether the cell was unpacked from an archive, see `symbolic.read.cell.load`.
+        folder: folder to which paths in the section are relative.
+        stored: whether the cell was unpacked from an archive.
     """
     package_dirs = _read_folders(table, folder)
     own = table.table("xacro_arguments", {})
@@ -262,7 +264,8 @@ def _read_description(
 
 
 def _check_arguments(table: TableReader, path: Path, arguments: Arguments) -> None:
-    """Refuse arguments for a file that takes none, and warn of a calibration that is not given."""
+    """Record a problem for arguments of a file that takes none; warn if a calibration is not
+    given."""
     content = safe_io.read_bytes(path, safe_io.URDF_BYTES)
     if not is_xacro(content):
         if arguments:
@@ -291,7 +294,7 @@ def _argument(value: str, folder: Path) -> str:
 
 @contextmanager
 def _recorded(table: TableReader, key: str) -> Iterator[None]:
-    """Record errors about the content that a key names as problems of that key."""
+    """Record errors in the content that a key names as problems of this key."""
     try:
         yield
     except UrdfError as error:
@@ -302,7 +305,7 @@ def _recorded(table: TableReader, key: str) -> Iterator[None]:
 
 
 def _read_named(table: TableReader) -> NamedRobot:
-    """Read the description of a named robot; problems are recorded at the key 'robot'."""
+    """Read the description of a robot given by name. Problems are recorded at the key 'robot'."""
     name = table.text("robot")
     if table.has("urdf"):
         table.add("urdf", "found beside 'robot'; give one of the two")
@@ -357,7 +360,7 @@ def _read_described(
 
 
 def _read_chain(table: TableReader) -> tuple[str, str]:
-    """Read the links at which the arm begins and ends; '' for the first if only a flange is
+    """Read the links at which the arm begins and ends; '' for the first if only the flange is
     given."""
     if not table.has("chain"):
         return "", table.text("flange")
@@ -373,7 +376,7 @@ def _read_chain(table: TableReader) -> tuple[str, str]:
 def _read_model(
     table: TableReader, urdf: Urdf, locked: Positions, root: str, flange: str
 ) -> pin.Model | None:
-    """Return the arm's model, or record problems and return None."""
+    """Return the arm's model; after recorded problems None."""
     moving: tuple[str, ...] | None = None
     model: pin.Model | None = None
     with _recorded(table, "urdf"):
@@ -423,12 +426,12 @@ _ROBOT_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,99}")
 
 @dataclass(frozen=True)
 class NamedRobot:
-    """A description on this machine.
+    """Files of a robot description that a package has on this machine.
 
     Attributes:
         path: the URDF or xacro file.
         arguments: arguments of the xacro file.
-        package_dirs: folders with the packages that the URDF or xacro file names.
+        package_dirs: folders of packages that the URDF or xacro file names.
     """
 
     path: Path
@@ -437,10 +440,10 @@ class NamedRobot:
 
 
 def named_robot(name: str) -> NamedRobot:
-    """Return the robot description called `name`, downloading its files if necessary.
+    """Return the files of the robot description called `name`; download them if necessary.
 
     Raises:
-        OutsideError: none has that name, a package is missing, or the download failed.
+        OutsideError: no description has this name, a package is missing, or the download failed.
     """
     if not _ROBOT_NAME.fullmatch(name):
         raise OutsideError("is no name; allowed are letters, digits, '_' and '-'", code="no-name")
@@ -468,7 +471,7 @@ def _installed(name: str) -> NamedRobot:
 
 
 def _has_links(path: Path) -> bool:
-    """Return True if a file describes any link; some packages ship empty files."""
+    """Return True if a file describes at least one link. Some packages contain empty files."""
     return b"<link" in safe_io.read_bytes(path, safe_io.URDF_BYTES)
 
 

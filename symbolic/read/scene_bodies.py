@@ -1,7 +1,7 @@
-"""Shapes of a scene with their poses in the world, and the reports of what cannot be a body.
+"""Shapes of a scene with their poses in the world, and reports of parts that cannot become bodies.
 
-Whatever is left out is reported by name and reason: an obstacle that is silently missing would
-make every verdict of a cell wrong.
+Every part that is left out is reported by name and reason: an obstacle that is silently missing
+would make every verdict on a cell wrong.
 """
 
 from __future__ import annotations
@@ -30,19 +30,19 @@ from symbolic.records.problems import MAX_NAME_LENGTH, Problems, shown
 
 MOST_BODIES = 5000
 SLAB = (10.0, 10.0, 0.1)
-"""What stands for a plane: as wide as a body may be, around its point nearest to the world's origin
-[m]."""
+"""Size of the box that replaces a plane [m]: as wide as a body may be, around the plane's point
+nearest to the world's origin."""
 
 ANY = Range(-1e9, 1e9)
-"""A number that is only read; whether a body may have it is judged with the body."""
+"""Range of a number that is only read; it is checked later with the body."""
 
 DIGITS = 12
-"""Decimals of lengths and angles that are written: what is beyond them is rounding of poses."""
+"""Decimals of lengths and angles that are written. Further decimals are rounding of poses."""
 
 
 def slab_below(pose: Array) -> tuple[Box, Array]:
-    """Return the box, and its pose (4, 4), that stands for a half-space below a frame's x-y
-    plane."""
+    """Return the box that replaces the half-space below a frame's x-y plane, and its pose (4,
+    4)."""
     normal = pose[:3, 2]
     middle = normal * (normal @ pose[:3, 3] - SLAB[2] / 2.0)
     return Box(np.array(SLAB)), transform(pose[:3, :3], middle)
@@ -53,11 +53,11 @@ class ImportedScene:
     """The obstacles of a scene.
 
     Attributes:
-        bodies: in the world; every name is a body's of an environment, and unique.
-        left_out: parts that are no bodies, each 'NAME: why'.
-        notes: differences between a body and its scene, and bodies that are only visible, each
+        bodies: bodies in the world frame, with unique names that are valid for the environment.
+        left_out: parts that could not become bodies, each 'NAME: reason'.
+        notes: differences between a body and the scene, and bodies that are only visible, each
             'NAME: text'.
-        files: meshes that stand in the scene itself, STL by the path that their body names.
+        files: meshes embedded in the scene, as STL content by the path that the body names.
     """
 
     bodies: tuple[Body, ...]
@@ -69,15 +69,15 @@ class ImportedScene:
         """Return the scene as `[[environment]]` tables of a workcell file.
 
         Args:
-            folder: that of the file, to which meshes are relative.
-            meshes: where `files` are.
+            folder: folder of the workcell file, to which mesh paths are relative.
+            meshes: folder that contains `files`.
         """
         return [_table(body, folder, meshes) for body in self.bodies]
 
 
 @dataclass
 class SceneBuilder:
-    """Collects the bodies of a scene."""
+    """Collector of the bodies of a scene."""
 
     bodies: list[Body] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
@@ -87,8 +87,8 @@ class SceneBuilder:
     names: set[str] = field(default_factory=lambda: {PAYLOAD_NAME})
 
     def add(self, name: str, shape: Shape | Capsule, pose: Array) -> None:
-        """Add a shape at its pose (4, 4) in the world, unless a workcell would refuse it; add a
-        capsule as a cylinder and two spheres."""
+        """Add a shape at its pose (4, 4) in the world, unless a workcell would refuse it. A capsule
+        becomes a cylinder and two spheres."""
         if isinstance(shape, Capsule):
             self.add(name, Cylinder(shape.radius, shape.length), pose)
             for end in (-0.5, 0.5):
@@ -118,8 +118,8 @@ class SceneBuilder:
             self.bodies.append(body)
 
     def triangles(self, name: str, vertices: Array, faces: NDArray[np.int64], pose: Array) -> None:
-        """Add a mesh without a file: vertices (n, 3) [m], and vertex indices (m, 3) of its
-        faces."""
+        """Add a mesh without a file: vertices (n, 3) [m], and indices (m, 3) of the vertices of
+        each face."""
         import trimesh
 
         content = trimesh.exchange.stl.export_stl(trimesh.Trimesh(vertices, faces, process=False))
@@ -134,7 +134,7 @@ class SceneBuilder:
             self.files[file] = content
 
     def mesh(self, name: str, address: str, file: Path, scale: Array, pose: Array) -> None:
-        """Add a mesh that a scene's file names by its address."""
+        """Add a mesh that a scene's file names by an address."""
         path = file_at(address, file)
         if path is None:
             self.leave(name, f"its mesh {shown(address)} is not found; {WHERE}")
@@ -142,7 +142,7 @@ class SceneBuilder:
             self.add(name, Mesh(path, scale), pose)
 
     def half_space(self, name: str, normal: Array, offset: float, pose: Array) -> None:
-        """Add the half-space normal x + offset <= 0 of a frame at a pose (4, 4)."""
+        """Add the half-space normal . x + offset <= 0 of a frame at a pose (4, 4)."""
         length = float(np.linalg.norm(normal))
         if length < 1e-6:
             self.problems.add(name, "found a plane without a normal")
@@ -157,11 +157,11 @@ class SceneBuilder:
         self.add(name, *slab_below(pose))
 
     def leave(self, name: str, why: str) -> None:
-        """Report that something is left out."""
+        """Report that a part is left out."""
         self.left_out.append(f"{safe_io.printable(name) or 'scene'}: {why}")
 
     def note(self, name: str, what: str) -> None:
-        """Report that something is represented differently than in the scene."""
+        """Report that a part is represented differently than in the scene."""
         self.notes.append(f"{safe_io.printable(name) or 'scene'}: {what}")
 
     def _name(self, name: str) -> str:
@@ -173,7 +173,7 @@ class SceneBuilder:
 
 
 def _table(body: Body, folder: Path, meshes: Path) -> dict[str, Any]:
-    """Convert a body to a table of a workcell file; mesh paths below `meshes` become relative to
+    """Convert a body to a table of a workcell file. Mesh paths below `meshes` become relative to
     `folder`."""
     table: dict[str, Any] = {"name": body.name, "kind": type(body.shape).__name__.lower()}
     for key, value in vars(body.shape).items():
@@ -193,8 +193,8 @@ def _plain(values: Array) -> list[float]:
 
 
 def quaternion_pose(xyz: Array, xyzw: Array, at: str, problems: Problems) -> Array:
-    """Compute the pose (4, 4) of a position and a quaternion x, y, z, w; zeros mean no rotation, as
-    in MoveIt."""
+    """Compute the pose (4, 4) of a position and a quaternion x, y, z, w. Four zeros mean no
+    rotation, as in MoveIt."""
     length = float(np.linalg.norm(xyzw))
     if length and abs(length - 1.0) > 1e-2:
         problems.add(at, f"found a quaternion of length {length:g}; allowed is 1")
@@ -211,7 +211,8 @@ _VARIABLES = ("GZ_SIM_RESOURCE_PATH", "GAZEBO_MODEL_PATH", "SDF_PATH")
 
 
 def file_at(address: str, file: Path) -> Path | None:
-    """Return the file behind an address in an SDF file; for a model's folder, its description."""
+    """Return the file behind an address in an SDF file. If the address is a model's folder, return
+    the model's description."""
     scheme, _, rest = address.rpartition("://")
     if not rest or "\0" in rest or scheme not in ("", "file", "model", "package"):
         return None
@@ -233,7 +234,7 @@ def file_at(address: str, file: Path) -> Path | None:
 
 
 def _main_file(folder: Path) -> str | None:
-    """Return the description that a model.config names, the last of several versions."""
+    """Return the description file that a model.config names, the last one of several versions."""
     config = folder / "model.config"
     if not config.is_file():
         return None

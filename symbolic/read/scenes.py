@@ -1,5 +1,5 @@
 """Scenes of other programs as bodies of a cell's environment: SDF of Gazebo and Drake, planning
-scenes of MoveIt (its message in YAML, and the text that RViz saves), and MJCF."""
+scenes of MoveIt (the message in YAML, and the text that RViz saves), and MJCF."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ SDF_SHAPES = {"box": Box, "sphere": Sphere, "cylinder": Cylinder, "capsule": Cap
 
 
 def read_scene(path: Path) -> ImportedScene:
-    """Read the obstacles of SDF (a world or a model), of MJCF, or of a MoveIt planning scene (its
-    message in YAML, or its text format, .scene).
+    """Read the obstacles of an SDF file (a world or a model), of an MJCF file, or of a MoveIt
+    planning scene (the message in YAML, or the text format .scene).
 
     Raises:
-        SceneError: the file cannot be read, is no scene, or is wrong; every problem with its
-            place.
+        SceneError: the file cannot be read, is no scene, or is wrong. The message lists every
+            problem with its place.
     """
     found = SceneBuilder()
     try:
@@ -71,15 +71,15 @@ def read_scene(path: Path) -> ImportedScene:
 
 MOST_FILES = 500
 MOST_FRAMES = 100
-"""Longest chain of frames, each relative to the next."""
+"""Largest length of a chain of frames, each relative to the next."""
 
 OWN = ("", "__model__", "__root__")
-"""What a model's own frame is called."""
+"""Names of a model's own frame."""
 
 
 @dataclass
 class _Scope:
-    """Scope of names, a world or a model: its frames, and the models in it."""
+    """A scope of names, a world or a model, with its frames and the models in it."""
 
     part: ElementReader
     file: Path
@@ -92,7 +92,7 @@ class _Scope:
         self.frames[name] = (base, pose)
 
     def frame(self, name: str) -> Array:
-        """Compute the pose (4, 4) of a frame in the scope's own frame."""
+        """Compute the pose (4, 4) of a frame in the frame of the scope."""
         T_name, met = np.eye(4), 0
         while name not in (*OWN, "world") or (name == "world" and self.part.tag == "model"):
             head, _, rest = name.partition("::")
@@ -119,7 +119,7 @@ class _Sdf:
         self._files = 0
 
     def read(self, path: Path) -> None:
-        """Add the first world of a file, or its models."""
+        """Add the first world of a file, or the file's models if it has no world."""
         root = self._root(path, found_in="")
         worlds = list(root.named("world").values())
         for further in worlds[1:]:
@@ -167,7 +167,7 @@ class _Sdf:
     def _place(
         self, scope: _Scope, name: str, model: _Scope, placed: tuple[str, Array], by: ElementReader
     ) -> None:
-        """Enter a model at its pose, which `placed` states for its placement frame."""
+        """Add a model at its pose. `placed` states the pose of the model's placement frame."""
         base, pose = placed
         frame = by.raw("placement_frame") or by.inner_text("placement_frame")
         scope.enter(name, base, pose @ inverse(model.frame(frame)))
@@ -201,8 +201,8 @@ class _Sdf:
             self._place(scope, wanted or name, inner, placed, by)
 
     def _pose(self, part: ElementReader) -> tuple[str, Array]:
-        """Read an element's pose (4, 4) and the frame that it is relative to, '' for the
-        default."""
+        """Read the pose (4, 4) of an element and the name of the frame to which it is relative; ''
+        for the default frame."""
         pose = part.child("pose")
         if pose is None:
             return "", np.eye(4)
@@ -269,7 +269,7 @@ class _Sdf:
 
 
 FIXED = ("", "world")
-"""Frames that are taken for the world's."""
+"""Names of frames that count as the world frame."""
 
 _DIMENSIONS = {"box": 3, "sphere": 1, "cylinder": 2, "cone": 2, "plane": 4}
 _TYPES = {1: "box", 2: "sphere", 3: "cylinder", 4: "cone"}
@@ -277,7 +277,7 @@ _ADDED = (None, 0, "", "0", "\0", "ADD", "add")
 
 
 class _Loader(yaml.CSafeLoader):
-    """YAML loader in which 1e-05 is a number, as the writers of these files mean it."""
+    """YAML loader that reads 1e-05 as a number, as the writers of these files mean it."""
 
 
 _Loader.add_implicit_resolver(
@@ -291,7 +291,7 @@ def read_message(path: Path) -> dict[str, Any]:
     """Read the fields of a message that `ros2 topic echo` or robowflex wrote as YAML.
 
     Raises:
-        OutsideError: it is no such file.
+        OutsideError: the file is not such a message.
     """
     text = safe_io.text(safe_io.read_bytes(path, safe_io.URDF_BYTES))
     try:
@@ -305,10 +305,10 @@ def read_message(path: Path) -> dict[str, Any]:
 
 
 def _read_moveit(path: Path, found: SceneBuilder) -> None:
-    """Add a planning scene's message, or its world alone.
+    """Add the bodies of a planning scene's message, or of a message with its world alone.
 
     Raises:
-        OutsideError: it is no such scene.
+        OutsideError: the file is not such a message.
     """
     document = read_message(path)
     scene = document.get("scene")
@@ -374,7 +374,7 @@ _PLACES = {"primitives": "primitive_poses", "meshes": "mesh_poses", "planes": "p
 
 
 def _frame(table: TableReader, place: str = "position", turn: str = "orientation") -> Array:
-    """Read a pose (4, 4), its numbers by letters or in a row; a missing part is zero."""
+    """Read a pose (4, 4), with numbers by letters or in a row. A missing part is zero."""
     parts = []
     for key, letters in ((place, "xyz"), (turn, "xyzw")):
         if isinstance(table.raw(key, None), Mapping):
@@ -386,8 +386,8 @@ def _frame(table: TableReader, place: str = "position", turn: str = "orientation
 
 
 def _primitive(name: str, kind: str, sizes: Array, pose: Array, found: SceneBuilder) -> None:
-    """Add a primitive of MoveIt's message: a cylinder's size is length, radius, a plane's its
-    coefficients."""
+    """Add a primitive of MoveIt's message. The sizes of a cylinder are length and radius, those of
+    a plane its coefficients."""
     match kind:
         case "box":
             found.add(name, Box(sizes), pose)
@@ -442,10 +442,11 @@ def _triangles(name: str, vertices: Any, faces: Any, pose: Array, found: SceneBu
 
 
 def _read_moveit_text(path: Path, found: SceneBuilder) -> None:
-    """Add the objects of a scene's text: a name behind a star, then rows of numbers.
+    """Add the objects of a scene in text format: for each a name after a star, then rows of
+    numbers.
 
     Raises:
-        OutsideError: it is no such text.
+        OutsideError: the file is not in this format.
     """
     text = safe_io.text(safe_io.read_bytes(path, safe_io.URDF_BYTES))
     _, *objects = re.split(r"^\*", text, flags=re.MULTILINE)
@@ -462,8 +463,8 @@ def _read_moveit_text(path: Path, found: SceneBuilder) -> None:
 
 
 def _written_object(name: str, words: Sequence[str], placed: bool, found: SceneBuilder) -> None:
-    """Add one object of such a text; an old text gives shapes in the world, a newer one in the
-    object."""
+    """Add one object of a scene in text format. In an old file shapes are relative to the world, in
+    a new file to the object."""
     at = 0
 
     def numbers(count: int) -> Array:
@@ -552,4 +553,4 @@ READERS: dict[str, Callable[[Path, SceneBuilder], None]] = {
     ".yml": _read_moveit,
     ".scene": _read_moveit_text,
 }
-"""What reads a file, by the root of XML, or by the end of its name."""
+"""Functions that read a scene file, by the root tag of XML or by the end of the file's name."""

@@ -1,8 +1,9 @@
 """The JSON Schema of workcell files, with which editors complete keys and mark wrong values.
 
-Ranges come from `symbolic.records.quantities`, keys and meanings from the records. A schema knows
-no robot and no geometry: it accepts more than `symbolic.read.cell.load`, and never refuses what
-`load` accepts. Keys that `dual-arm-carry propose` adds to a problem file are not required.
+Ranges come from `symbolic.records.quantities`, keys and meanings from the records. A schema cannot
+describe robots and geometry: it accepts more than `symbolic.read.cell.load`, and never refuses a
+file that `load` accepts. Keys that `dual-arm-carry propose` adds to a problem file are not
+required.
 """
 
 from __future__ import annotations
@@ -180,14 +181,14 @@ def _body() -> Schema:
 
 
 def _fields(record: type, *without: str) -> dict[str, Schema]:
-    """Return the schemas of a record's fields, except some, with their meanings."""
+    """Return the schemas of a record's fields, some excepted, with their meanings."""
     hints = get_type_hints(record, include_extras=True)
     keys = {field: kind for field, kind in hints.items() if field not in without}
     return _described(record, {key: _kind(kind) for key, kind in keys.items()})
 
 
 def _kind(kind: Any) -> Schema:
-    """Return the schema of an annotation, see `symbolic.read.tables.checked`."""
+    """Return the schema of an annotation that `symbolic.read.tables.checked` knows."""
     marks: tuple[Any, ...] = ()
     if get_origin(kind) is Annotated:
         kind, *marks = get_args(kind)  # type: ignore[assignment]
@@ -212,7 +213,7 @@ def _kind(kind: Any) -> Schema:
 
 
 def _described(record: type, keys: dict[str, Schema]) -> dict[str, Schema]:
-    """Return schemas with the meanings that the record's docstring states of its attributes."""
+    """Add the meanings of attributes, from the record's docstring, to the schemas of its fields."""
     text = (getdoc(record) or "").partition("Attributes:\n")[2].partition("\n\n")[0]
     entries = re.findall(r"^ {4}(\w[\w, ]*): (.*(?:\n {8}.*)*)", text, re.MULTILINE)
     meanings = {
@@ -241,7 +242,7 @@ def _table(keys: dict[str, Schema], required: Sequence[str] = ()) -> Schema:
 
 
 def _array(each: Schema | Sequence[Schema], least: int = 0, most: int | None = None) -> Schema:
-    """Return the schema of an array of alike entries, or of one entry for each schema."""
+    """Return the schema of an array, with one schema for all entries or one per entry."""
     if not isinstance(each, dict):
         sizes = {"minItems": len(each), "maxItems": len(each)}
         return {"type": "array", "prefixItems": list(each), **sizes}
@@ -255,7 +256,8 @@ def _number(allowed: Range | None, kind: str = "number") -> Schema:
 
 
 def _vector(allowed: Range, size: int, filling: bool = False) -> Schema:
-    """Return the schema of an array of numbers; with `filling`, one number stands for all."""
+    """Return the schema of an array of numbers. With `filling`, one number may stand for all
+    entries."""
     numbers = _array(_number(allowed), size, size)
     return _any(_number(allowed), numbers) if filling else numbers
 

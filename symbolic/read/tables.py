@@ -1,14 +1,14 @@
-"""Nested values of TOML, YAML and JSON converted to records; annotations of a record's fields state
-the allowed values.
+"""Conversion of nested values of TOML, YAML and JSON to records; annotations of a record's fields
+state the allowed values.
 
-`checked` knows `bool`, `int`, `float`, `str`, `Literal`, enumerations, `tuple`,
-`Mapping[str, ...]`, `... | None`, dataclasses, `Any` for values that are only passed on, and
-`Annotated` with what `symbolic.array` has. What a record's own `__post_init__` refuses is wrong as
-well. (msgspec, which was tried, knows neither numbers that may be missing nor shapes of arrays.)
+`checked` supports `bool`, `int`, `float`, `str`, `Literal`, enumerations, `tuple`, `Mapping[str,
+...]`, `... | None`, dataclasses, `Any` for values that are only passed on, and `Annotated` with the
+marks of `symbolic.array`. Values that a record's `__post_init__` refuses are wrong too. (msgspec is
+not used: it supports neither numbers that may be missing nor shapes of arrays.)
 
-Every problem is gathered, reading does not stop at the first: a wrong value is recorded, and a
-harmless stand-in of its kind takes its place. Stand-ins never escape: whoever reads raises when
-`Problems.found` is not empty. `FirstProblem` stops at once.
+All problems are collected; reading does not stop at the first. A wrong value is recorded, and a
+harmless placeholder of its kind takes its place. Placeholders never escape: the caller raises an
+error if `Problems.found` is not empty. `FirstProblem` stops at once.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from symbolic.records.poses import pose_matrix, read_only
 from symbolic.records.problems import MAX_NAME_LENGTH, Label, Problems, shown, suggestion
 
 MOST_UNKNOWN = 10
-"""Most unknown keys of one table that are reported."""
+"""Largest number of unknown keys of one table that are reported."""
 
 ANY_NUMBER = Range(-math.inf, math.inf)
 
@@ -54,12 +54,12 @@ _REQUIRED: Any = object()
 
 
 class TableReader:
-    """A table of a document, read key by key.
+    """Reader of one table of a document, key by key.
 
     Args:
-        data: the table's content.
-        path: its key path, '' for the top level.
-        problems: where problems go.
+        data: content of the table.
+        path: key path of the table, '' for the top level.
+        problems: collector of problems.
     """
 
     def __init__(self, data: Mapping[str, Any], path: str, problems: Problems) -> None:
@@ -79,15 +79,16 @@ class TableReader:
         return f"{self.path}.{key}" if self.path else key
 
     def add(self, key: str, text: str) -> None:
-        """Record a problem of a key's value."""
+        """Record a problem with the value of a key."""
         self.problems.add(self.at(key), text)
 
     def clean(self, *keys: str) -> bool:
-        """Return True if the values of these keys have no problem."""
+        """Return True if the values of these keys have no problems."""
         return self.problems.clean(*map(self.at, keys))
 
     def raw(self, key: str, default: Any = _REQUIRED) -> Any:
-        """Return the value as written; a missing required key is a problem and gives None."""
+        """Return a value as it is in the document. A missing required key is a problem and gives
+        None."""
         self._known.add(key)
         if key in self._data:
             return self._data[key]
@@ -97,18 +98,18 @@ class TableReader:
         return default
 
     def has(self, key: str) -> bool:
-        """Return True if an optional key is present; `close` then does not report it as unknown."""
+        """Return True if an optional key is present. `close` then does not report it as unknown."""
         return self.raw(key, None) is not None
 
     def refuse(self, key: str, others: Sequence[str]) -> None:
-        """Record a problem if a key stands together with one of the keys that it excludes."""
+        """Record a problem if a key is present together with keys that it excludes."""
         beside = " and ".join(repr(other) for other in others if other in self._data)
         self._known.update(others)
         if beside:
             self.add(key, f"found beside {beside}; allowed is one or the other")
 
     def close(self) -> None:
-        """Record every key that no reader has used."""
+        """Record every key that was not read as unknown."""
         unknown = [key for key in self._data if key not in self._known]
         allowed = ", ".join(sorted(self._known))
         for key in unknown[:MOST_UNKNOWN]:
@@ -121,7 +122,8 @@ class TableReader:
             )
 
     def value(self, key: str, kind: Any, default: Any = _REQUIRED) -> Any:
-        """Read a value by an annotation, see `checked`; the default is returned unchecked."""
+        """Read a value that `checked` converts by an annotation. The default is returned
+        unchecked."""
         value = self.raw(key, default)
         if key in self._data and not (value is None and default is not _REQUIRED):
             return checked(kind, value, self.at(key), self.problems)
@@ -141,7 +143,8 @@ class TableReader:
         default: Sequence[float] | Array | None = None,
         filling: bool = False,
     ) -> Array:
-        """Read an array with one range per entry; with `filling`, one number fills it."""
+        """Read an array with one range per entry. With `filling`, one number stands for all
+        entries."""
         value = self.raw(key, _REQUIRED if default is None else list(default))
         if value is None and (default is not None or key not in self):
             return read_only(np.ones(len(allowed)) if default is None else default)
@@ -162,8 +165,8 @@ class TableReader:
         return str(self.value(key, Label, _REQUIRED if default is None else default))
 
     def texts(self, key: str, meaning: str) -> tuple[str, ...]:
-        """Read an array of texts, described by `meaning` in messages; empty if missing or after
-        a problem."""
+        """Read an array of texts; () if it is missing or after a problem. `meaning` describes the
+        array in messages."""
         value = self.raw(key, [])
         if isinstance(value, list) and all(isinstance(entry, str) and entry for entry in value):
             return tuple(value)
@@ -171,7 +174,7 @@ class TableReader:
         return ()
 
     def table(self, key: str, default: Mapping[str, Any] | None = None) -> TableReader:
-        """Read a sub-table; after a problem, an empty one that reports nothing further."""
+        """Read a sub-table. After a problem return an empty one that reports nothing further."""
         value = self.raw(key, _REQUIRED if default is None else default)
         if value is not None and isinstance(value, Mapping):
             return TableReader(value, self.at(key), self.problems)
@@ -180,9 +183,9 @@ class TableReader:
         return TableReader({}, self.at(key), Problems())
 
     def tables(self, key: str, exactly: int | None = None) -> list[TableReader]:
-        """Read an array of tables: optional and of any length, or of exactly that many.
+        """Read an array of tables: optional and of any length, or with exactly `exactly` tables.
 
-        Of too many the first ones.
+        If there are too many, the first ones are returned.
         """
         value = self.raw(key, [] if exactly is None else _REQUIRED)
         if value is None:
@@ -202,7 +205,7 @@ class TableReader:
         """Read a record whose fields are the table's keys, except those passed as `given`.
 
         Raises:
-            ValueError: the record itself refuses the values.
+            ValueError: the record's own check refuses the values.
         """
         found, own_hints = dict(given), _hints(cast("Any", kind))
         for field in fields(kind):  # type: ignore[arg-type]
@@ -229,13 +232,14 @@ def _hints(kind: Any) -> dict[str, Any]:
 
 
 def checked(kind: Any, value: Any, path: str, problems: Problems) -> Any:
-    """Check a value against an annotation; record a problem and return a placeholder otherwise.
+    """Return a value if it satisfies an annotation; otherwise record a problem and return a
+    placeholder.
 
     Args:
         kind: the annotation.
-        value: the value as its document has it.
-        path: its key path.
-        problems: where problems go.
+        value: the value in the document.
+        path: key path of the value.
+        problems: collector of problems.
     """
     marks: tuple[Any, ...] = ()
     if get_origin(kind) is Annotated:
@@ -284,7 +288,7 @@ def checked(kind: Any, value: Any, path: str, problems: Problems) -> Any:
 
 
 def _single(kind: Any, marks: Sequence[Any], value: Any, path: str, problems: Problems) -> Any:
-    """Check a number, a text, one of several words, or a boolean."""
+    """Return a checked number, text, word of a list, or boolean."""
     ranges = [mark for mark in marks if isinstance(mark, Range)]
     if kind is float:
         return checked_number(value, ranges[0] if ranges else ANY_NUMBER, path, problems)
@@ -332,7 +336,7 @@ def _stand_in(kind: Any, marks: Sequence[Any] = ()) -> Any:
 
 
 def checked_number(value: Any, allowed: Range, path: str, problems: Problems) -> float:
-    """Return the value as a finite float within a range, or record a problem and return a
+    """Return a value as a finite float within a range; otherwise record a problem and return a
     placeholder."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         problems.add(path, f"found {shown(value)}; allowed is a number, {allowed.allowed()}")
@@ -352,8 +356,8 @@ def checked_number(value: Any, allowed: Range, path: str, problems: Problems) ->
 def checked_vector(
     value: Any, allowed: Sequence[Range], path: str, problems: Problems, filling: bool = False
 ) -> Array:
-    """Return the value as a read-only array, or record problems and return a placeholder; with
-    `filling`, one number fills the array."""
+    """Return a value as a read-only array; otherwise record problems and return a placeholder. With
+    `filling`, one number stands for all entries."""
     if filling and not isinstance(value, list):
         return read_only(np.full(len(allowed), checked_number(value, allowed[0], path, problems)))
     if not isinstance(value, list) or len(value) != len(allowed):
@@ -370,7 +374,8 @@ def checked_vector(
 def _array(
     shape: Shape, marks: Sequence[Any], value: Any, path: str, problems: Problems
 ) -> np.ndarray[Any, Any]:
-    """Check a read-only array of numbers, finite unless the annotation allows missing entries."""
+    """Return a checked read-only array of numbers. They have to be finite, unless the annotation
+    allows missing entries."""
     for mark in marks:
         if isinstance(mark, Range):
             filling = any(isinstance(other, BroadcastScalar) for other in marks)
@@ -407,7 +412,7 @@ def _array(
 
 
 SHAPES = {"box": Box, "cylinder": Cylinder, "sphere": Sphere, "mesh": Mesh}
-"""Shapes of a body by their kinds in a file."""
+"""Classes of a body's shape by the kind in a file."""
 
 
 def read_pose(table: TableReader, key: str) -> Array:
@@ -440,10 +445,10 @@ def read_file(
     """Return the absolute path of a readable file named relative to `folder`.
 
     Args:
-        table, key: where it is named.
-        folder: base of its relative path.
-        most: its largest size [bytes].
-        at: where it is, if its name is no path but an address.
+        table, key: table and key that name the file.
+        folder: folder to which the path is relative.
+        most: largest allowed size [bytes].
+        at: path of the file if its name is an address and not a path.
     """
     value = table.raw(key)
     if value is None:
@@ -465,9 +470,9 @@ def read_inertia(table: TableReader, bound: float, allowed: str = "a 3 x 3 matri
     """Read the (3, 3) matrix of the key `inertia` [kg m^2] of a rigid body.
 
     Args:
-        table: where it stands.
-        bound: no principal moment can exceed this [kg m^2].
-        allowed: the allowed values, for a message.
+        table: table with the key.
+        bound: upper bound of the principal moments [kg m^2].
+        allowed: description of the allowed values, for messages.
     """
     value = table.raw("inertia")
     path, problems = table.at("inertia"), table.problems
@@ -485,11 +490,11 @@ def read_inertia(table: TableReader, bound: float, allowed: str = "a 3 x 3 matri
 
 
 def inertia_problem(inertia: Array, bound: float) -> str:
-    """Return why a matrix is not the inertia of a rigid body, or an empty string.
+    """Return why a matrix is not the inertia of a rigid body; '' if it is.
 
     Args:
         inertia: (3, 3) [kg m^2].
-        bound: no principal moment can exceed this [kg m^2].
+        bound: upper bound of the principal moments [kg m^2].
     """
     scale = float(np.abs(inertia).max())
     if np.abs(inertia - inertia.T).max() > 1e-9 * scale:

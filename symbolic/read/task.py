@@ -1,9 +1,9 @@
-"""Task section of a workcell file, and the redundant joints: those beyond six, whose paths are
+"""Task section of a workcell file, and the redundant joints: the joints beyond six, whose paths are
 decision variables.
 
-Which joints are redundant, and where they may stand to begin with, is read off one posture path
-along the hand-made trajectory: of all joints together, by Newton steps of least norm that drift to
-the middle of the joints' ranges where the box leaves them free (Liegeois, IEEE T-SMC 7(12), 1977).
+One posture path along the hand-made trajectory decides which joints are redundant and their initial
+positions. It moves all joints together by Newton steps of least norm that drift to the middle of
+the joint ranges as far as the box leaves them free (Liegeois, IEEE T-SMC 7(12), 1977).
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ MAX_WAYPOINTS = 100
 MAX_PIECES = 10
 
 MOST_TURN = 5.0
-"""Largest rotation vector of a waypoint [rad]: a full turn less what the spline may swing out."""
+"""Longest rotation vector of a waypoint [rad]: a full turn minus the overshoot of the spline."""
 
 FORCE_LIMIT_MARGIN = 1.001
 
@@ -96,8 +96,8 @@ def read_task(table: TableReader, holding: Array) -> tuple[Task, tuple[Redundanc
 
 
 def _allocation(table: TableReader, law: TimeLaw, holds: bool) -> str:
-    """Read the contact model's name; the default is 'holding-hands' for hands that hold by
-    themselves, else 'soft-finger' in drivable cells, else 'paper'."""
+    """Read the name of the contact model. The default is 'holding-hands' for hands with a holding
+    force, else 'soft-finger' in drivable cells, else 'paper'."""
     pads = "soft-finger" if law.is_drivable else "paper"
     usual = _known_allocation(table, "allocation", "holding-hands" if holds else pads)
     own = _known_allocation(table, "drivable_allocation", usual)
@@ -119,8 +119,8 @@ def _known_allocation(table: TableReader, key: str, usual: str) -> str:
 
 
 def _check_vectors(task: Task, problems: Problems) -> None:
-    """Check that every allowed rotation vector stays well below a full turn, where the map from
-    vectors to rotations is singular."""
+    """Check that every allowed rotation vector is clearly shorter than a full turn, where the map
+    from vectors to rotations is singular."""
     for k, waypoint in enumerate(task.waypoints):
         farthest = np.maximum(np.abs(waypoint.lower[3:]), np.abs(waypoint.upper[3:]))
         if np.linalg.norm(farthest) > MOST_TURN:
@@ -133,9 +133,8 @@ def _check_vectors(task: Task, problems: Problems) -> None:
 
 
 def with_force_limit(workcell: Workcell) -> Workcell:
-    """Return the workcell with the default bounds of the force limit if its file has none: from a
-    thousandth above the force that holds the payload level and still to the smaller reference
-    force."""
+    """Return the workcell with bounds of the force limit. If the file has none, they are the force
+    that holds the payload level and at rest plus a thousandth, and the smaller reference force."""
     task = workcell.task
     if np.isfinite(task.force_limit[1]):
         return workcell
@@ -145,7 +144,7 @@ def with_force_limit(workcell: Workcell) -> Workcell:
 
 
 def _orientation(table: TableReader) -> Orientation:
-    """Read the meaning of the last three numbers of every pose of the task."""
+    """Read the convention of the last three numbers of every pose."""
     known = get_args(Rotation)
     rotation = cast("Rotation", table.choice("rotation", known, known[0]))
     rpy = table.vector("rotation_reference", (quantity.ANGLE,) * 3, default=(0.0, 0.0, 0.0))
@@ -157,7 +156,7 @@ def _orientation(table: TableReader) -> Orientation:
 
 
 def _force_limit(table: TableReader) -> tuple[float, float]:
-    """Read the bounds of the force limit; the upper one is infinite if the file has none."""
+    """Read the bounds of the force limit. The upper bound is infinite if the file has none."""
     if not table.has("force_limit"):
         return (0.0, np.inf)
     low, high = table.vector("force_limit", (quantity.FORCE,) * 2)
@@ -200,7 +199,7 @@ def _waypoints(table: TableReader, names: Sequence[str]) -> list[Waypoint]:
 
 
 def _read_initial(table: TableReader, free: list[Waypoint], names: Sequence[str]) -> Array:
-    """Read the initial free waypoints (n_free, 6); the centres of the bounds by default."""
+    """Read the initial free waypoints (n_free, 6). The default is the middle of the bounds."""
     value = table.raw("initial", None)
     path, problems = table.at("initial"), table.problems
     if value is None:
@@ -235,21 +234,22 @@ def _read_initial(table: TableReader, free: list[Waypoint], names: Sequence[str]
 
 
 FULL_TURN = 2.0 * np.pi
-"""Widest default bounds of a joint, about its initial value [rad]: beyond it repeats itself."""
+"""Largest width of a joint's default bounds, about its initial value [rad]. Beyond it positions
+repeat."""
 
 MOST_BEYOND = 6
-"""Most joints beyond six of one arm, without those that move both: the choice among them is made by
-trying all."""
+"""Largest number of redundant joints of one arm, without those that move both arms. All choices are
+tried."""
 
 
 @dataclass(frozen=True)
 class RedundancyEntry:
-    """Entry of a redundant joint in a file; None where the file states nothing.
+    """Entry of a redundant joint in a workcell file.
 
     Attributes:
-        path: of the entry in the file.
-        joint: 'robot/joint', or a joint's name, which stands for that of either robot.
-        lower, upper, initial: (n_waypoints,) [rad or m].
+        path: key path of the entry.
+        joint: 'robot/joint', or the name of a joint of either robot.
+        lower, upper, initial: (n_waypoints,) [rad or m]; None if the file does not state them.
     """
 
     path: str
@@ -276,8 +276,8 @@ def read_redundant(table: TableReader, n_waypoints: int) -> tuple[RedundancyEntr
 def with_redundancy(
     workcell: Workcell, entries: Sequence[RedundancyEntry], problems: Problems
 ) -> Workcell:
-    """Return the workcell with its redundant joints, chosen and placed automatically where the file
-    states none."""
+    """Return the workcell with its redundant joints. Joints and positions that the file does not
+    state are chosen automatically."""
     if not problems.clean("robots", "task", "contacts", *SHAPE_KEYS):
         return workcell
     models = [arm_model(robot) for robot in workcell.robots]
@@ -323,7 +323,8 @@ def with_redundancy(
 def _choice(
     workcell: Workcell, i: int, entries: Sequence[RedundancyEntry], common: tuple[str, ...]
 ) -> tuple[PosturePath | None, tuple[str, ...]]:
-    """Return arm i's path along the hand-made trajectory, if needed, and its redundant joints."""
+    """Return the redundant joints of arm i, and its path along the hand-made trajectory if it is
+    needed, else None."""
     robot = workcell.robots[i]
     model = arm_model(robot)
     names, beyond = list(model.names)[1:], model.nq - FOLLOWING
@@ -345,7 +346,8 @@ def _choice(
 
 
 def _entry(entries: Sequence[RedundancyEntry], robot: Robot, name: str) -> RedundancyEntry:
-    """Return the entry of a joint; an entry for this robot takes precedence over one for either."""
+    """Return the entry of a joint. An entry for this robot takes precedence over an entry for
+    either robot."""
     by_name = {entry.joint: entry for entry in reversed(entries)}
     nothing = RedundancyEntry("", name)
     return by_name.get(f"{robot.name}/{name}", by_name.get(name, nothing))
@@ -384,19 +386,20 @@ def _joint(
 
 
 SEEDS = 24
-"""Random postures from which the start posture is looked for."""
+"""Number of random postures from which the start posture is searched."""
 
 MAX_NEWTON_STEPS = 80
-"""Newton steps to the start posture, and at most to each pose after it."""
+"""Largest number of Newton steps to the start posture, and to each pose after it."""
 
 POSES_PER_PIECE = 4
-"""Poses per piece of the path."""
+"""Number of poses per piece of the path."""
 
 CLOSE = 1e-4
-"""Pose error of a reached posture [m, rad]; the values are only a proposal."""
+"""A posture with a smaller pose error counts as reached [m, rad]. The values are only a
+proposal."""
 
 CENTRING_SHARE = 0.05
-"""Share of the way to the middle of their ranges that joints go in a step where they are free."""
+"""Share of the way to the middle of their ranges by which free joints move in a step."""
 
 
 @dataclass(frozen=True)
@@ -404,15 +407,17 @@ class PosturePath:
     """Path of an arm's joints along the hand-made trajectory.
 
     Attributes:
-        q: (n, joints) at poses evenly spaced along the path parameter, ends included [rad or m].
-        jacobian: (n, 6, joints) of the flange there.
+        q: (n, joints) joint positions at poses evenly spaced along the path parameter, ends
+            included [rad or m].
+        jacobian: (n, 6, joints) Jacobian of the flange at these poses.
     """
 
     q: Array
     jacobian: Array
 
     def at_waypoints(self, joint: int) -> Array:
-        """Return a joint's positions (n_waypoints,) [rad or m], rounded to 0.001."""
+        """Return the positions (n_waypoints,) of a joint at the waypoints [rad or m], rounded to
+        0.001."""
         return np.asarray(np.round(self.q[::POSES_PER_PIECE, joint], 3))
 
 
@@ -434,14 +439,15 @@ class _Chain:
         self.middle = (self.low + self.high) / 2.0
 
     def jacobian(self, q: Array) -> Array:
-        """Compute the Jacobian (6, joints) of the flange, in axes of the root."""
+        """Compute the Jacobian (6, joints) of the flange, along the axes of the root."""
         J: Array = pin.computeFrameJacobian(
             self.model, self.data, q, self.flange, pin.LOCAL_WORLD_ALIGNED
         )
         return J
 
     def error(self, q: Array, pose: Array) -> Array:
-        """Compute the pose error (6,) to a box pose."""
+        """Compute the error (6,) of the flange from the placement that a box pose requires [m,
+        rad]."""
         T = self.to_root @ box_placement(self.orientation, pose) @ self.T_box_flange
         pin.framesForwardKinematics(self.model, self.data, q)
         here = self.data.oMf[self.flange]
@@ -449,7 +455,8 @@ class _Chain:
         return np.concatenate([T[:3, 3] - here.translation, turn])
 
     def reach(self, q: Array, pose: Array) -> Array | None:
-        """Find a posture near q that holds the box within the joint limits; None without one."""
+        """Find a posture near q that holds the box within the joint limits; None if there is
+        none."""
         for _ in range(MAX_NEWTON_STEPS):
             error = self.error(q, pose)
             if np.linalg.norm(error) < CLOSE and self.within(q):
@@ -483,11 +490,11 @@ def posture_path(
 
     Args:
         robot, contact: the arm and its contact.
-        task: with or without its redundant joints.
-        held: joints that stand still, by their indices [rad or m].
+        task: the task, with or without redundant joints.
+        held: positions of joints that do not move, by index [rad or m].
 
     Returns:
-        None where none is found.
+        The path; None if none is found.
     """
     # Not imported at the top: it needs CasADi, which cells of six-joint arms do not to be read.
     from symbolic.path.spline import path_basis
@@ -521,15 +528,16 @@ def posture_path(
 def best_conditioned(
     path: PosturePath | None, n_joints: int, forced: Sequence[int]
 ) -> tuple[int, ...]:
-    """Return the redundant joints of an arm: those that leave the other six conditioned best.
+    """Choose the redundant joints of an arm such that the other six joints are conditioned best.
 
     Args:
-        path: the arm along the hand-made trajectory; None: the joints next to the root.
-        n_joints: of the arm.
+        path: path of the arm along the hand-made trajectory; None chooses the joints next to the
+            root.
+        n_joints: number of joints of the arm.
         forced: indices of joints that are redundant in any case.
 
     Returns:
-        Indices, ascending, n_joints - 6 of them.
+        n_joints - 6 indices in ascending order.
     """
     others = [joint for joint in range(n_joints) if joint not in forced]
     chosen = [

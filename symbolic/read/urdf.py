@@ -1,11 +1,11 @@
 """URDF files as checked records, before any other library reads them.
 
-What is taken over is what this project uses: the tree of links and joints, masses and inertias,
-collision shapes, and the addresses of meshes. Everything taken is checked here, each problem with
-its element and attribute; everything else in the file is left alone. Pinocchio is given
-`Urdf.kinematics`, which holds nothing that was not checked.
+Only what this project uses is read: the tree of links and joints, masses and inertias, collision
+shapes, and the addresses of meshes. All of it is checked here, and each problem names its element
+and attribute. The rest of the file is ignored. Pinocchio gets `Urdf.kinematics`, which contains
+only checked content.
 
-An SRDF, MoveIt's companion of a URDF, says which pairs of links are not checked.
+An SRDF, MoveIt's companion of a URDF, states which pairs of links are not checked for collision.
 """
 
 from __future__ import annotations
@@ -31,21 +31,27 @@ from symbolic.records.problems import Problems, shown, suggestion
 
 MOST_LINKS = 500
 MOST_MESHES = 2000
-"""Most different mesh files."""
+"""Largest number of different mesh files."""
 
 LARGEST_GYRATION = 10.0
-"""No inertia is larger than that of its mass at this distance [m]."""
+"""Largest radius of gyration: an inertia may not exceed mass times its square [m]."""
 
 INERTIA_SLACK = 1e-6
-"""Published inertias are rounded, and those of small covers often wrong by more than they are: so
-much below zero a principal moment may lie [kg m^2]; a hundredth of it at larger ones."""
+"""Published inertias are rounded, and those of small covers often have large relative errors. A
+principal moment may be below zero by this [kg m^2], for larger inertias by a hundredth of the
+inertia."""
 
 _MOMENTS = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 @dataclass(frozen=True)
 class UrdfMesh:
-    """Mesh with its address as written; scale: (3,) factor per axis."""
+    """A mesh of a URDF.
+
+    Attributes:
+        address: the address as written in the file.
+        scale: (3,) factor per axis.
+    """
 
     address: str
     scale: Array
@@ -53,7 +59,12 @@ class UrdfMesh:
 
 @dataclass(frozen=True)
 class UrdfCollision:
-    """Collision shape of a link; pose: (4, 4) in the link's frame."""
+    """A collision shape of a link.
+
+    Attributes:
+        shape: the shape.
+        pose: (4, 4) in the link's frame.
+    """
 
     shape: Box | Cylinder | Sphere | Capsule | UrdfMesh
     pose: Array
@@ -65,12 +76,13 @@ class Urdf:
 
     Attributes:
         file: the file's name, without its folder.
-        name: the robot's.
-        links: names, in the order of the file.
-        joints: by name, in the order of the file.
-        collisions: by link that has any, in the order of the file.
-        visuals: by link the addresses of its visual meshes as written.
-        kinematics: URDF text of links with their inertias and of joints, nothing else.
+        name: name of the robot.
+        links: names of the links, in the order of the file.
+        joints: joints by name, in the order of the file.
+        collisions: collision shapes by link, in the order of the file; links without shapes are
+            left out.
+        visuals: addresses of visual meshes by link, as written.
+        kinematics: URDF text with only the links, their inertias and the joints.
     """
 
     file: str
@@ -83,11 +95,11 @@ class Urdf:
 
     @cached_property
     def moved_by(self) -> Mapping[str, str]:
-        """The joint by each link that is the child of one."""
+        """Name of the joint that moves each link, by the link's name."""
         return {joint.child: name for name, joint in self.joints.items()}
 
     def above(self, link: str) -> Iterator[str]:
-        """Yield the joints between a link and the root, from the link upwards."""
+        """Yield the joints between a link and the root, starting at the link."""
         while link in self.moved_by:
             yield self.moved_by[link]
             link = self.joints[self.moved_by[link]].parent
@@ -113,8 +125,8 @@ def read_urdf(path: Path, arguments: Arguments = (), package_dirs: Sequence[Path
         package_dirs: folders of packages that the xacro file may name.
 
     Raises:
-        UrdfError: the file cannot be read, is no XML in UTF-8, or an element of it is wrong; every
-            problem with its element and attribute.
+        UrdfError: the file cannot be read, is not XML in UTF-8, or an element is wrong. The message
+            lists every problem with its element and attribute.
     """
     try:
         content = description_content(path, arguments, package_dirs)
@@ -128,7 +140,7 @@ def parse_urdf(content: bytes, file: str) -> Urdf:
     """Parse the records of a URDF's content; `file` names it in messages.
 
     Raises:
-        UrdfError: see `read_urdf`.
+        UrdfError: the content is not XML in UTF-8, or an element is wrong.
     """
     problems = Problems()
     try:
@@ -233,7 +245,8 @@ def _visual_meshes(link: ElementReader) -> tuple[str, ...]:
 JOINT_TYPES = ("revolute", "continuous", "prismatic", "fixed", "floating", "planar")
 SMALLEST_AXIS = 1e-6
 FULL_TURNS = 4.0 * np.pi
-"""A continuous joint is taken as a revolute one with these limits either way [rad]."""
+"""A continuous joint counts as a revolute joint with limits of this size in both directions
+[rad]."""
 
 
 @dataclass(frozen=True)
@@ -243,9 +256,9 @@ class UrdfJoint:
     Attributes:
         kind: one of `JOINT_TYPES`.
         parent, child: names of links.
-        lower, upper: limits [rad or m]; of a continuous joint `FULL_TURNS` either way.
-        mimics: the joint that it follows, '' where it moves by itself.
-        multiplier, offset: its position is multiplier * (the other's) + offset.
+        lower, upper: limits [rad or m]; `FULL_TURNS` in both directions for a continuous joint.
+        mimics: name of the joint that this joint follows; '' if it moves by itself.
+        multiplier, offset: position = multiplier * (position of the followed joint) + offset.
     """
 
     kind: str
@@ -302,7 +315,7 @@ def _joint(joint: ElementReader) -> UrdfJoint:
 
 
 def pose_of(part: ElementReader) -> Array:
-    """Read an element's origin (4, 4); the identity without one."""
+    """Read the origin (4, 4) of an element; the identity if it has none."""
     origin = part.child("origin")
     if origin is None:
         return read_only(np.eye(4))
@@ -369,10 +382,10 @@ def _mimic_problem(joints: Mapping[str, UrdfJoint]) -> tuple[str, str] | None:
 def read_srdf(path: Path) -> tuple[IgnoredPair, ...]:
     """Read the `disable_collisions` elements of an SRDF file, in its order; ignore the rest.
 
-    They are pairs of links with the file's reason, such as 'Adjacent' or 'Never', or none.
+    Each is a pair of links with a reason from the file, such as 'Adjacent' or 'Never', or without.
 
     Raises:
-        UrdfError: the file cannot be read, is no XML, or one of these elements lacks a link.
+        UrdfError: the file cannot be read, is not XML, or such an element lacks a link.
     """
     try:
         return _parse_srdf(safe_io.read_bytes(path, safe_io.URDF_BYTES), path.name)
