@@ -1,11 +1,11 @@
 """A user's folder of compiled libraries, addressed by their ingredients.
 
-Every library has a manifest beside it, written last, that holds the library's checksum and its
-own: an interrupted or damaged build is not found and is made again. Files appear by renaming, so
-two processes that build the same thing do no harm; a lock per key spares them the second build.
+Every library has a manifest beside it, which is written last and holds the checksums of both. So an
+interrupted or damaged build is not found and is made again. Files appear by renaming, so two
+processes that build the same library do no harm; a lock per key avoids the second build.
 
-What lies here is loaded as code. The folder and its files must therefore belong to the user and be
-writable by nobody else, and nobody else may be able to exchange the folder itself.
+Files of the folder are loaded as code. So the folder and its files must belong to the user and be
+writable by nobody else, and nobody else may be able to replace the folder.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from symbolic.errors import OutsideError
 from symbolic.safe_io import replace_file
 
 CACHE_FORMAT = 1
-"""Part of every key; rises when what is stored changes its meaning."""
+"""Part of every key. It rises when stored content changes its meaning."""
 
 _SOURCES = {".py", ".c", ".h"}
 
@@ -47,19 +47,19 @@ _STALE_SECONDS = 3600.0
 _MOST_BYTES = 256 * safe_io.MEBIBYTE
 
 MOST_KEPT = 4 * 2**30
-"""Size from which on a cache loses what was not used for longest [bytes]."""
+"""Above this size a cache removes what was not used for longest [bytes]."""
 
 _NOTED_SECONDS = 3600.0
-"""Least time between two recorded uses."""
+"""Least time between two recorded uses of an entry [s]."""
 
 _KEPT = {".so", ".o", ".json", ".lock", ".draft"}
 _KEY_END = re.compile("[-.]")
 
 
 def key_of(what: str, **parts: object) -> str:
-    """Compute the key of an entry in a cache: its kind and, by name, all its ingredients.
+    """Compute the key of a cache entry from its kind and all its ingredients, by name.
 
-    Every key of a cache comes from here, so that what makes it anew can be read in one place:
+    Every key of a cache is computed here. The ingredients of each kind are:
 
       library        the text, the compiler, its level and flags            (`codegen.build`)
       part           the same of an object file that several libraries share
@@ -90,8 +90,8 @@ def library_version(name: str) -> str:
 
 
 def source_digest(*packages: str) -> str:
-    """Compute the SHA-256 of the Python and C sources of installed packages and modules, without
-    importing them."""
+    """Compute the SHA-256 of the Python and C sources of installed packages and modules. Nothing is
+    imported."""
     total: list[str | bytes] = []
     for name, file in _sources(packages):
         total += [name, file.read_bytes()]
@@ -99,7 +99,8 @@ def source_digest(*packages: str) -> str:
 
 
 def _code(file: Path) -> str | bytes:
-    """Return a source without what has no effect: comments and docstrings of a Python file."""
+    """Return the part of a source that has an effect: a Python file without comments and
+    docstrings."""
     raw = file.read_bytes()
     if file.suffix != ".py":
         return raw
@@ -113,8 +114,8 @@ class _Undocumented(ast.NodeTransformer):
 
 
 def _sources(packages: Sequence[str]) -> Iterator[tuple[str, Path]]:
-    """Yield every source file of packages or modules, with a name that does not depend on its
-    folder."""
+    """Yield every source file of packages or modules, with a name that does not depend on the
+    folder of installation."""
     for package in packages:
         spec = importlib.util.find_spec(package)
         if spec is None:
@@ -128,10 +129,10 @@ def _sources(packages: Sequence[str]) -> Iterator[tuple[str, Path]]:
 
 
 def largest_size() -> int:
-    """Return the largest size of a cache [bytes], see `Cache.trim`.
+    """Return the size [bytes] above which `Cache.trim` removes files.
 
     Raises:
-        CodegenError: the environment variable holds no number.
+        CodegenError: the environment variable DUAL_ARM_CACHE_LIMIT is not a number.
     """
     own = os.environ.get("DUAL_ARM_CACHE_LIMIT", "")
     try:
@@ -145,8 +146,8 @@ def largest_size() -> int:
 
 
 def default_folder() -> Path:
-    """Return DUAL_ARM_CACHE if set, otherwise `dual-arm-carry` in the user's cache folder
-    (XDG_CACHE_HOME, by default ~/.cache)."""
+    """Return the folder in DUAL_ARM_CACHE if set, otherwise `dual-arm-carry` in the user's cache
+    folder (XDG_CACHE_HOME, by default ~/.cache)."""
     own = os.environ.get("DUAL_ARM_CACHE", "")
     return Path(own).expanduser() if own else platformdirs.user_cache_path("dual-arm-carry")
 
@@ -162,12 +163,12 @@ class Usage:
 
 @dataclass(frozen=True)
 class CacheEntry:
-    """A library found in the cache, its content verified.
+    """A library in the cache with verified content.
 
     Attributes:
-        key: its key.
+        key: key of the entry.
         library: path of the shared library.
-        facts: what was stored with it.
+        facts: facts that were stored with the library.
     """
 
     key: str
@@ -176,7 +177,7 @@ class CacheEntry:
 
 
 class Cache:
-    """A cache folder: its safety and its files."""
+    """A cache folder: it checks the folder's safety, finds, stores and removes files."""
 
     def __init__(self, folder: Path | None = None) -> None:
         self.folder = Path(os.path.abspath(folder if folder is not None else default_folder()))
@@ -185,7 +186,7 @@ class Cache:
         """Return the entry of this key, or None if it is missing or damaged.
 
         Raises:
-            CodegenError: others than the user can write to the folder or the file.
+            CodegenError: somebody other than the user can write to the folder or the file.
         """
         facts = self.read_record(key)
         if facts is None:
@@ -205,10 +206,10 @@ class Cache:
         """Make a library and store it under this key, replacing an existing one.
 
         Args:
-            key: see `digest`.
-            make: given the path of the library to write, in a folder of its own, it writes it and
+            key: key of the entry, from `key_of`.
+            make: function that writes the library to the given path, in a separate folder, and
                 returns further facts to store.
-            suffix: of the file: an object file is kept likewise.
+            suffix: suffix of the file; object files are stored in the same way.
 
         Raises:
             CodegenError: the folder is unsafe or cannot be written to.
@@ -260,15 +261,16 @@ class Cache:
         *,
         anew: bool = False,
     ) -> tuple[Found, bool]:
-        """Return the value stored under a key; if it is missing, exactly one process makes it.
+        """Return the value stored under a key. If it is missing, exactly one process makes it.
 
         Args:
-            find: loads it; None where it is missing, damaged or cannot be loaded.
-            make: makes and keeps it.
-            anew: make it even if it is there.
+            key: key of the value.
+            find: function that loads the value; None if it is missing, damaged or cannot be loaded.
+            make: function that makes and stores the value.
+            anew: True to make the value even if it is stored.
 
         Returns:
-            It, and whether it was there already.
+            The value, and True if it was already stored.
         """
         # A lock writes: what is there already needs none.
         found = None if anew else find()
@@ -281,7 +283,7 @@ class Cache:
     def code_digest(self, *packages: str) -> str:
         """Compute the SHA-256 of packages' sources without comments and docstrings.
 
-        Parsing takes a while: the answer is kept by the digest of the sources as they are.
+        Parsing takes a while, so the result is cached under the digest of the unchanged sources.
         """
         key = key_of("code", sources=source_digest(*packages))
         record = self.read_record(key)
@@ -293,9 +295,9 @@ class Cache:
 
     @contextmanager
     def lock(self, key: str) -> Iterator[None]:
-        """Keep other processes and threads from building the same key meanwhile.
+        """Keep other processes and threads from building the same key during the `with` block.
 
-        It only saves work: where the file system has no locks it does nothing.
+        The lock only saves work. On a file system without locks it does nothing.
         """
         self._make_folder()
         with _writing(self.folder):
@@ -308,22 +310,26 @@ class Cache:
             os.close(handle)
 
     def usage(self) -> Usage:
-        """Return the number of libraries and the total size."""
+        """Return the number of libraries and the total size of all files."""
         kept = self._by_use()
         files = [file for *_, files in kept for file in files]
         libraries = sum(file.suffix == ".so" for file in files)
         return Usage(libraries, len(files), sum(size for _, size, _ in kept))
 
     def trim(self, most: int | None = None) -> int:
-        """Remove the least recently used files until the rest is at most so large [bytes]; None for
-        the limit of DUAL_ARM_CACHE_LIMIT in gibibytes, by default `MOST_KEPT`. Removed libraries
-        are made again when they are needed.
+        """Remove the least recently used files until the rest is at most `most` bytes.
+
+        Removed libraries are made again when they are needed.
+
+        Args:
+            most: size to keep [bytes]; None for the limit in DUAL_ARM_CACHE_LIMIT (gibibytes), by
+                default `MOST_KEPT`.
 
         Returns:
             The number of libraries removed.
 
         Raises:
-            CodegenError: the environment variable holds no number.
+            CodegenError: the environment variable is not a number.
         """
         most = largest_size() if most is None else most
         kept = self._by_use()
@@ -339,7 +345,7 @@ class Cache:
         return libraries
 
     def _by_use(self) -> list[tuple[float, int, list[Path]]]:
-        """Return, per key, the time of last use, the size and the files; oldest first."""
+        """Return for each key the time of last use, the size and the files, oldest first."""
         found: dict[str, tuple[float, int, list[Path]]] = {}
         if self.folder.exists():
             self._require_safe()
@@ -361,7 +367,8 @@ class Cache:
 
     @contextmanager
     def build_folder(self) -> Iterator[Path]:
-        """Make a folder for files of a build, locked against sweeping, and remove it afterwards.
+        """Make a folder for the files of a build, locked against `_sweep`, and remove it after the
+        `with` block.
 
         Raises:
             CodegenError: the cache is unsafe or cannot be written to.
@@ -380,9 +387,9 @@ class Cache:
             os.close(handle)
 
     def _sweep(self) -> None:
-        """Remove the remains of builds that were killed long ago.
+        """Remove the folders of builds that were killed long ago.
 
-        A living build holds a lock, so that a clock that jumps does not end it.
+        A running build holds a lock, so a jump of the clock does not remove its folder.
         """
         for left in self.folder.glob("build-*"):
             with suppress(OSError):
@@ -397,7 +404,11 @@ class Cache:
         self._require_safe()
 
     def _require_safe(self) -> None:
-        """Refuse a folder that others can write to or exchange."""
+        """Check that nobody else can write to the folder or replace it.
+
+        Raises:
+            CodegenError: somebody else can.
+        """
         try:
             own = self.folder.stat()
         except FileNotFoundError:
@@ -420,7 +431,8 @@ class Cache:
                 )
 
     def _read_own(self, path: Path) -> bytes | None:
-        """Return the content of a file that nobody else can have written; None if it is missing."""
+        """Return the content of a file that only the user can have written; None if it is
+        missing."""
         try:
             found = path.stat()
             if not stat.S_ISREG(found.st_mode):

@@ -1,4 +1,4 @@
-"""The system's C compiler: detection, identity, flags, one call of it."""
+"""The system's C compiler: how it is found, identified and called."""
 
 from __future__ import annotations
 
@@ -42,25 +42,27 @@ LANE_FLAGS = (
 )
 
 MACHINE_FLAGS = ("-march=native", "-mcpu=native")
-"""The machine's own instruction set, as compilers name it: the first that one accepts is used.
-What it stands for is part of a library's key, so machines that share a cache keep their own."""
+"""Flags for the machine's own instruction set, as compilers name it; the first accepted one is
+used. The instruction set is part of a library's key, so machines that share a cache keep their own
+libraries."""
 
 SMALL_SOURCE = 600_000
 LARGE_SOURCE = 2_000_000
-"""Bytes of C. A candidate's evaluator (0.3 MB) takes gcc 5 to 6 s at -O3, 3 s at -O1 and 1.4 s at
--O0, and runs in 0.39, 0.49 and 1.6 ms. One straight line of code costs about 20 s per megabyte at
--O3, 15 s at -O1 and 5 s at -O0, and gains nothing from -O3."""
+"""Size of a C source above which the optimisation level falls [bytes]. A candidate's evaluator (0.3
+MB) takes gcc 5 to 6 s at -O3, 3 s at -O1 and 1.4 s at -O0, and runs in 0.39, 0.49 and 1.6 ms. One
+straight line of code costs about 20 s per megabyte at -O3, 15 s at -O1 and 5 s at -O0, and gains
+nothing from -O3."""
 
 LANE_LEVEL = 2
-"""Optimisation level of what is written for lanes: -O3 compiles longer and gains nothing."""
+"""Optimisation level of code for lanes: -O3 compiles longer and gains nothing."""
 
 LONG_PART = 90_000
-"""Bytes of a function from which on it is compiled at a level less. The clearances of the rack (193
-kB) take gcc 12 in lanes 5.1 s at -O2 and 2.2 s at -O1, and run in 32.6 and 29.9 us per 64; one by
-one they take it 4.0 s at -O3 and 2.3 s at -O2, and run in 11.3 and 11.2 us."""
+"""A function with more bytes of C than this is compiled one level lower. The clearances of the rack
+(193 kB) take gcc 12 in lanes 5.1 s at -O2 and 2.2 s at -O1, and run in 32.6 and 29.9 us per 64; one
+by one they take it 4.0 s at -O3 and 2.3 s at -O2, and run in 11.3 and 11.2 us."""
 
 LEVELS = (0, 1, 2, 3)
-"""Optimisation levels that are used: -O0 for the largest sources, -O3 for the smallest."""
+"""Optimisation levels in use: -O0 for the largest sources, -O3 for the smallest."""
 
 NAMES = ("cc", "gcc", "clang")
 
@@ -68,8 +70,9 @@ PACKAGED = "ziglang"
 """A package of PyPI with a compiler in it, for machines that have none (extra `compiler`)."""
 
 ZIG_FLAGS = ("-fno-sanitize=undefined",)
-"""Zig instruments C at -O0 with checks for undefined behaviour, unless forbidden. Their handlers
-are only linked where the library itself is at -O0, so that others cannot be loaded."""
+"""Flags for Zig. By default it instruments C at -O0 with checks for undefined behaviour. The
+handlers of these checks are linked only if the library itself is at -O0, so other libraries could
+not be loaded."""
 
 _PART = """
 #include <math.h>
@@ -86,10 +89,12 @@ __attribute__((visibility("default"))) double whole(const double *values, int co
   return {sum};
 }}
 """
-"""C of the self-test: signed arithmetic, arrays, the mathematical library, calls between files."""
+"""C text of the self-test: signed arithmetic, arrays, the mathematical library, calls between
+files."""
 
 MOST_SECONDS = 1200.0
-"""Time after which a compiler counts as hung [s]; sources here take seconds, at most minutes."""
+"""A compiler that runs longer than this counts as hung [s]. Sources here take seconds, at most
+minutes."""
 
 _CORES = threading.BoundedSemaphore(available_cores())
 
@@ -100,9 +105,9 @@ _INTERRUPTED = threading.Event()
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """On Ctrl-C in the `with` block, end all compilers of this process and start no more.
+    """On Ctrl-C in the `with` block, end all compilers of this process and start no new ones.
 
-    They begin again with what the main thread wants compiled next.
+    Compilation starts again when the main thread asks for the next function.
     """
     if threading.current_thread() is threading.main_thread():
         _INTERRUPTED.clear()
@@ -120,7 +125,7 @@ def stop_if_interrupted() -> None:
     """Raise in a worker thread if the main thread was interrupted.
 
     Raises:
-        KeyboardInterrupt: it was, see `interruptible`.
+        KeyboardInterrupt: the main thread was interrupted in a block of `interruptible`.
     """
     if _INTERRUPTED.is_set():
         raise KeyboardInterrupt
@@ -137,13 +142,13 @@ _OTHER_COMPILER = "name another one in the environment variable CC"
 
 @dataclass(frozen=True)
 class Compiler:
-    """A C compiler that has answered.
+    """A C compiler that runs on this machine.
 
     Attributes:
-        command: its absolute path, then arguments that the user's CC carries.
-        version: everything that it says of itself, target included.
-        machine: the flag for the machine's own instruction set; empty if it knows none.
-        instructions: its macros for that set.
+        command: absolute path of the compiler, then the arguments in the user's CC.
+        version: output of the compiler on its version and target.
+        machine: flag for the machine's own instruction set; '' if the compiler has none.
+        instructions: macros that the compiler defines for this instruction set.
     """
 
     command: tuple[str, ...]
@@ -153,7 +158,7 @@ class Compiler:
 
     @property
     def identity(self) -> str:
-        """Text that changes with the compiler, its version, its target and the machine."""
+        """Text that differs between compilers, versions, targets and machines."""
         return "\n".join([*self.command, self.version, *self.machine, self.instructions])
 
     def compile(
@@ -166,13 +171,15 @@ class Compiler:
     ) -> None:
         """Compile one C file at optimisation `level` (0 to 3) into a shared library.
 
-        No more than one compiler per core runs at once.
+        At most one compiler per core runs at a time.
 
         Args:
+            source: the C file.
             result: the file to write.
-            flags: further ones.
-            objects: object files that go into the library; None to make one of the source, and no
-                library.
+            level: optimisation level.
+            flags: further flags.
+            objects: object files that are linked into the library; None to compile the source to an
+                object file instead of a library.
 
         Raises:
             CodegenError: the compiler refused the source, could not write, or was killed.
@@ -186,12 +193,13 @@ class Compiler:
             self._run(command, source, result)
 
     def self_test(self, folder: Path) -> None:
-        """Compile a part at every level, link the parts into a library at every level, load, call.
+        """Test the compiler: compile a part at every level, link the parts into a library at every
+        level, load it and call it.
 
-        It takes gcc 0.3 s of CPU time. All files are made in an empty folder of the cache.
+        The test takes gcc 0.3 s of CPU time. All files are made in an empty folder of the cache.
 
         Raises:
-            CodegenError: a step fails, or a library computes something else.
+            CodegenError: a step fails, or a library computes a wrong result.
         """
         objects = []
         for level in LEVELS:
@@ -275,26 +283,27 @@ class Compiler:
 
 
 def default_level(c_bytes: int) -> int:
-    """Return the optimisation level that keeps the build of a source of this size short."""
+    """Return the optimisation level for a source of this size [bytes] that keeps the build
+    short."""
     if c_bytes <= SMALL_SOURCE:
         return 3
     return 1 if c_bytes <= LARGE_SOURCE else 0
 
 
 def part_level(c_bytes: int, in_lanes: bool) -> int:
-    """Return the level of a function that is compiled separately (`codegen.parts`)."""
+    """Return the optimisation level of a function that is compiled separately (`codegen.parts`)."""
     level = LANE_LEVEL if in_lanes else default_level(c_bytes)
     return level if c_bytes < LONG_PART else min(level, 1 if in_lanes else 2)
 
 
 def find_compiler() -> Compiler:
-    """Return the C compiler: the one that CC names, otherwise the first that works of cc, gcc,
-    clang, and that of the package `ziglang`.
+    """Return the C compiler in CC if set, otherwise the first that works of cc, gcc, clang, and the
+    compiler of the package `ziglang`.
 
-    A set CC is taken at its word: if it does not run, nothing else is tried.
+    If CC is set and does not run, no other compiler is tried.
 
     Raises:
-        CodegenError: there is none.
+        CodegenError: no compiler works.
     """
     own = os.environ.get("CC", "")
     found = _find(own, os.environ.get("PATH", ""))
@@ -348,7 +357,7 @@ def _find(cc: str, path: str) -> Compiler | None:
 
 
 def _ask(command: tuple[str, ...], *arguments: str) -> str | None:
-    """Return a compiler's output for these arguments; None if it refuses."""
+    """Return the output of a command for these arguments; None if it fails."""
     try:
         said = subprocess.run(
             [*command, *arguments],

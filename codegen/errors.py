@@ -4,12 +4,12 @@ from symbolic.errors import DualArmError, DualArmWarning
 
 
 class CodegenError(DualArmError):
-    """C code could not be generated, compiled, cached or loaded."""
+    """Error of generating, compiling, caching, loading or calling C code."""
 
 
 class FormError(CodegenError):
-    """CasADi wrote a form of C that has no form in lanes."""
+    """Error for C code of CasADi that cannot be translated to lanes."""
 
 
 class SlowerWarning(DualArmWarning, RuntimeWarning):
-    """Functions are not evaluated in the fastest way."""
+    """Warning that functions are not evaluated in the fastest way."""

@@ -3,8 +3,8 @@
 CasADi stores matrices by column. A CasADi (r, c) matrix is therefore a NumPy (c, r) array in C
 order without a copy; a column or row vector is (n,) and a scalar (1, 1) is ().
 
-Arrays are C-contiguous float64 and are passed by address, never copied; anything else that NumPy
-can turn into such an array is converted where that is allowed (`__call__`, `batch`).
+Arrays are C-contiguous float64 and are passed by address, never copied. `__call__` and `batch`
+convert other inputs to such arrays.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Signature:
 
     @classmethod
     def of(cls, function: ca.Function) -> Signature:
-        """Return the signature of a CasADi function, with sparse inputs and outputs as dense."""
+        """Return the signature of a CasADi function. Sparse inputs and outputs count as dense."""
         return cls(
             name=function.name(),
             input_names=tuple(function.name_in()),
@@ -209,17 +209,19 @@ class NumericFunction(ABC):
     def prepared(
         self, n: int, shared: Collection[str] = (), given: Mapping[str, Array] | None = None
     ) -> PreparedBatch:
-        """Prepare a batch of up to n evaluations on arrays with fixed addresses.
+        """Prepare a batch of up to n evaluations on arrays with fixed addresses, which can be
+        evaluated repeatedly.
 
-        For calls whose work is small beside `batch`'s own checks and allocations.
+        This pays if one evaluation takes little time compared with the checks and allocations of
+        `batch`.
 
         Args:
             n: at least 1.
-            shared: names of inputs that have one value for all evaluations.
+            shared: names of inputs with one value for all evaluations.
             given: the caller's own arrays for some inputs and outputs, (n, *shape), C-contiguous.
 
         Raises:
-            CodegenError: an array that does not fit.
+            CodegenError: an array does not fit.
         """
         given = given or {}
         names = (*self.input_names, *self.output_names)
@@ -251,8 +253,9 @@ class NumericFunction(ABC):
     def _prepared(
         self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
     ) -> tuple[Callable[[int], None], Callable[[], NativeCall] | None]:
-        """Return a call that evaluates the first `count` of a batch on fixed arrays, and one that
-        returns the addresses for C, None if C cannot evaluate it."""
+        """Return a function that evaluates the first `count` items of a batch on fixed arrays, and
+        a function that returns their addresses for C; None in place of the latter if C cannot
+        evaluate it."""
 
         def run(count: int) -> None:
             self._evaluate_batch(inputs, batched, outputs, count, 1)
@@ -261,7 +264,7 @@ class NumericFunction(ABC):
 
     @abstractmethod
     def _evaluate_block(self, inputs: Sequence[Array], block: NDArray[np.void]) -> None:
-        """Evaluate once into a record of `Signature.output_record`."""
+        """Evaluate once. All outputs are written into one record of `Signature.output_record`."""
 
     @abstractmethod
     def _evaluate_batch(
@@ -272,7 +275,7 @@ class NumericFunction(ABC):
         n: int,
         threads: int,
     ) -> None:
-        """Evaluate n > 0 candidates; `batched` states which inputs have one value for each."""
+        """Evaluate n > 0 candidates. `batched` is True for inputs with one value per candidate."""
 
     def _require_count(self, given: int) -> None:
         if given != len(self.input_names):
@@ -306,12 +309,14 @@ class NumericFunction(ABC):
 
 @dataclass(frozen=True)
 class NativeCall:
-    """Addresses with which C evaluates a prepared batch, as long as that is there.
+    """Addresses with which C evaluates a prepared batch. They are valid as long as the batch
+    exists.
 
     Attributes:
-        one, lanes: of `dual_arm_run` and `dual_arm_run_lanes` of `codegen/c`; 0 without lanes.
-        ports: of arguments and results.
-        work, lane_work: of their work memory.
+        one, lanes: addresses of `dual_arm_run` and `dual_arm_run_lanes` of `codegen/c`; the second
+            is 0 without lanes.
+        ports: address of the descriptions of arguments and results.
+        work, lane_work: addresses of the work memory of either function.
     """
 
     one: int
@@ -322,11 +327,12 @@ class NativeCall:
 
 
 class PreparedBatch:
-    """A batch that is evaluated over and over. Not to be shared between threads.
+    """A batch that is evaluated repeatedly. Threads must not share one.
 
     Attributes:
-        inputs, outputs: by name; written into and read by the caller, overwritten by every call.
-        size: evaluations that there is room for.
+        inputs, outputs: arrays by name. The caller writes inputs and reads outputs; every call
+            overwrites the outputs.
+        size: largest number of evaluations.
     """
 
     def __init__(
@@ -337,7 +343,7 @@ class PreparedBatch:
         run: Callable[[int], None],
         native: Callable[[], NativeCall] | None = None,
     ) -> None:
-        """Store the arrays and the call, see `NumericFunction.prepared`."""
+        """Store the arrays and the function that evaluates them."""
         self.inputs, self.outputs, self.size, self._run = inputs, outputs, size, run
         self._native = native
 
@@ -347,7 +353,8 @@ class PreparedBatch:
         return None if self._native is None else self._native()
 
     def __call__(self, count: int | None = None) -> dict[str, Array]:
-        """Evaluate all, or the first `count` of them, and return the outputs.
+        """Evaluate the first `count` items of the batch, or all for None, and return the outputs by
+        name.
 
         Raises:
             CodegenError: the function failed, or the batch does not fit into memory.

@@ -1,6 +1,7 @@
-"""CasADi's C: its grammar, and its form for numbers in lanes.
+"""CasADi's C: its grammar, and its translation to lanes.
 
-`codegen.parts` and this module read what CasADi's code generator writes. Of that text they rely on
+`codegen.parts` and this module read the output of CasADi's code generator. They rely on this
+grammar:
 
   text      = helper* constant* function+ entry
   constant  = "static const casadi_real casadi_" ("c" N | "zeros") "[" N "] = {" number,* "};"
@@ -13,12 +14,12 @@
   choice    = "if (arg[0] ? casadi_to_int(*arg[0]) : 0) {" call "} else {" call "}" "return 0;"
   entry     = "return casadi_f" N "(arg, res, iw, w, mem);"
 
-with at most one statement on a line. The forms that a line may take are listed in `FORMS`, each
-with an example, and in `KEPT_FORMS`, those that mean the same for lanes as for numbers. In lanes
-(the types of `codegen/c/lanes.h`) constants are equal in all lanes, comparisons and choices are
-masks, and a branch of `casadi.Function.if_else` runs if any lane needs it. A line of any other form
-raises a `FormError` with its text: a new version of CasADi, or a function of it that was not
-used before, then needs one more entry here.
+with at most one statement on a line. `FORMS` lists the forms of a line, each with an example;
+`KEPT_FORMS` those that mean the same for lanes as for numbers. In lanes (the types of
+`codegen/c/lanes.h`) constants are equal in all lanes, comparisons and choices are masks, and a
+branch of `casadi.Function.if_else` runs if any lane needs it. A line of any other form raises a
+`FormError` with its text. A new version of CasADi, or a CasADi function that was not used before,
+then needs one more entry here.
 """
 
 from __future__ import annotations
@@ -62,7 +63,7 @@ FORMS = [
         ),
     )
 ]
-"""What is written anew for lanes: an example, its pattern, and what takes its place. In order."""
+"""Forms that are rewritten for lanes, in order: an example, its pattern, and its replacement."""
 
 KEPT_FORMS = [
     (example, re.compile(pattern))
@@ -80,7 +81,8 @@ KEPT_FORMS = [
         ),
     )
 ]
-"""Comparisons and choices that are not of numbers: an example and its pattern."""
+"""Forms of comparisons and choices that do not depend on numbers in lanes: an example and its
+pattern."""
 
 _WORD = re.compile(r"[A-Za-z_]\w*")
 _WORDS = re.compile(
@@ -88,7 +90,7 @@ _WORDS = re.compile(
     r"casadi_(?:real|int|zeros|copy|fill|clear|fmax|fmin|fabs|sign|sq|mtimes_dense|vfmax|vfmin|"
     r"mmax|mmin|dot|norm_2|norm_inf)|casadi_[fc]\d+|lanes_\w+|a\d+|w\d+|wr\d+|INFINITY|NAN|e)$"
 )
-"""Words that lanes know; beside them a line holds arithmetic and indices only."""
+"""Words that are valid in lanes. Apart from these a line has only arithmetic and indices."""
 _COMPARES = re.compile(r"[?<>!|]|&&|==")
 
 _CONSTANT = re.compile(
@@ -111,11 +113,12 @@ _ENTRY = re.compile(r"^\s+return casadi_(f\d+)\(arg, res, iw, w, mem\);$", re.M)
 
 @dataclass(frozen=True)
 class LaneText:
-    """A function's C for lanes.
+    """The C text of a function for lanes.
 
     Attributes:
-        text: static functions and constants, all names with the prefix that was asked for.
-        entry: name of the function: arg, res, iw, w, mem as CasADi's, over `lanes_real`.
+        text: static functions and constants, with a prefix on all names.
+        entry: name of the function. It takes arg, res, iw, w, mem as CasADi's functions do, over
+            `lanes_real`.
     """
 
     text: str
@@ -126,12 +129,13 @@ def lane_text(generated: str, prefix: str, shared: Collection[int] = ()) -> Lane
     """Translate CasADi's C of one function to the lanes of `codegen/c/lanes.h`.
 
     Args:
-        generated: CasADi's text, with its own comments.
-        prefix: begins the names of everything defined.
-        shared: arguments of a straight function that are the same in all lanes and not in them.
+        generated: CasADi's text, with CasADi's comments.
+        prefix: prefix of all defined names.
+        shared: indices of arguments of a straight function that are passed as plain numbers, equal
+            for all lanes.
 
     Raises:
-        FormError: a line has a form that has none in lanes.
+        FormError: a line cannot be translated to lanes.
     """
     parts = []
     for name, size, values in _CONSTANT.findall(generated):
@@ -171,8 +175,8 @@ def _lines(function: re.Match[str], shared: Collection[int] = ()) -> str:
 
 
 def _choice(function: re.Match[str]) -> str | None:
-    """Translate `casadi.Function.if_else`: each branch runs if a lane needs it; a mask selects
-    its lanes."""
+    """Translate `casadi.Function.if_else`; None for another function. Each branch runs if a lane
+    needs it, and a mask selects its lanes."""
     branches = _CHOICE.match(function["body"])
     if branches is None or function["outputs"] is None:
         return None
@@ -198,7 +202,8 @@ def _choice(function: re.Match[str]) -> str | None:
 
 
 def _size(described: str) -> int:
-    """Return the number of entries of a result in CasADi's comment: name, name[3] or name[3x4]."""
+    """Return the number of entries of a result from CasADi's comment: name, name[3] or
+    name[3x4]."""
     shape = re.search(r"\[(\d+)(?:x(\d+))?\]", described)
     return prod(int(length) for length in shape.groups(default="1")) if shape else 1
 

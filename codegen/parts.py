@@ -1,19 +1,19 @@
 """C text in parts that are compiled separately, and long straight-line C in pieces.
 
-The same functions stand in many texts: an arm's Newton steps in everything that follows a path,
-and twice where both arms are of one kind. A part is a function that is long and calls no other
-(`straight` in the grammar of `codegen.lanes`, and functions of matrices that need no helper), in
-a file of its own, named by its content, so that texts which hold it share one object file. Parts of
-one text are compiled side by side, and those that are written for lanes at a level of their own.
+Many texts contain the same functions: an arm's Newton steps are in everything that follows a path,
+and twice if both arms are of one kind. A part is a long function that calls no other (`straight` in
+the grammar of `codegen.lanes`, and functions of matrices that need no helper). It is put in a file
+of its own, named by its content, so texts with the same part share one object file. Parts of one
+text are compiled side by side; parts for lanes have their own optimisation level.
 
-CasADi writes a function of scalars as one line of statements over as many local variables as live
-at once. A compiler takes more than in proportion to its length over such a text: every variable may
-conflict with every other. Cut into pieces, functions of some hundred statements which hand the
-variables that live on from one to the next by an array, the same statements run in the same order
+CasADi writes a function of scalars as one line of statements over as many local variables as are
+live at once. The compile time of such a text grows faster than its length, because every variable
+may conflict with every other. So it is cut into pieces: functions of some hundred statements that
+pass live variables to the next piece through an array. The same statements run in the same order
 and give the same bits.
 
-What has another form than these patterns say is neither taken out nor cut: it is compiled where it
-stands, which only takes longer.
+Text that does not match these patterns is neither taken out nor cut. It is compiled in its place,
+which only takes longer.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from codegen.cache import digest
 from codegen.compiler import part_level
 
 LEAST_BYTES = 8000
-"""Bytes of a function from which on it is compiled apart: a compiler's start costs 0.03 s, as much
-as 2000 bytes."""
+"""A function with at least so many bytes is compiled separately: the start of a compiler costs 0.03
+s, as much as 2000 bytes."""
 
 LEAST_ENTRY = 50_000
-"""The same of a text's own function, which others hardly share."""
+"""The same limit for the text's own function, which other texts rarely share [bytes]."""
 
 _CALLED = re.compile(
     r"^static int (?P<name>\w+_f\d+)(?P<rest>\(const (?P<real>casadi|lanes)_real\*\* arg, [^)]*\) "
@@ -74,11 +74,11 @@ _VARIABLE = re.compile(r"\ba\d+\b")
 
 @dataclass(frozen=True)
 class CodePart:
-    """A function in a file of its own.
+    """A function that is compiled in a file of its own.
 
     Attributes:
-        name: of the function, by the content of the file.
-        text: the file.
+        name: name of the function, made from the content of the file.
+        text: content of the file.
         level: optimisation level.
     """
 
@@ -88,11 +88,12 @@ class CodePart:
 
 
 def in_parts(text: str, lanes: int, most: int = 3) -> tuple[str, tuple[CodePart, ...]]:
-    """Replace the parts of a C text of `codegen.source` by declarations; return the text and the
+    """Replace the parts of a C text of `codegen.source` by declarations. Return the text and the
     parts, each once.
 
     Args:
-        lanes: of the text; 0 for what suits the machine.
+        text: the C text.
+        lanes: number of lanes of the text; 0 for the machine's width.
         most: highest optimisation level of a part.
     """
     before = {
@@ -138,7 +139,7 @@ def in_parts(text: str, lanes: int, most: int = 3) -> tuple[str, tuple[CodePart,
 @cache
 def runtime(name: str) -> str:
     """Return the text of a file of `codegen/c`, the runtime around generated functions, with its
-    includes filled in."""
+    includes inserted."""
     text = files("codegen").joinpath("c", name).read_text()
     return _INCLUDE.sub(lambda found: runtime(found[1]), text)
 
@@ -148,12 +149,12 @@ def _preamble(*runtimes: str) -> str:
 
 
 def is_long(body: str) -> bool:
-    """Return True if a function is long enough to be cut."""
+    """Return True if a function is so long that it is cut."""
     return body.count("\n") >= CUT_STATEMENTS
 
 
 def in_pieces(text: str) -> str:
-    """Cut the long straight-line functions of a C text, also of `codegen.lanes`, into pieces."""
+    """Cut the long straight-line functions of a C text into pieces. The text may be for lanes."""
     return _STRAIGHT.sub(_cut, text)
 
 
@@ -188,7 +189,8 @@ def _cut(found: re.Match[str]) -> str:
 
 
 def _used(piece: list[str]) -> tuple[set[str], set[str]]:
-    """Return the variables that a piece reads before it sets them, and those that it sets."""
+    """Return the variables that a piece reads before it sets them, and the variables that it
+    sets."""
     read, written = set[str](), set[str]()
     for line in piece:
         variables = _VARIABLE.findall(line)

@@ -1,5 +1,5 @@
-"""From CasADi functions to self-contained C text: with a batch driver, or with own C that calls
-them."""
+"""Generation of self-contained C text from CasADi functions: with a batch driver, or with own C
+that calls them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from codegen.parts import runtime
 def dense(function: ca.Function) -> ca.Function:
     """Return the function with dense inputs and outputs.
 
-    Entries of a dense input outside the sparsity that the function was made for are ignored.
+    Entries of a dense input outside the function's sparsity are ignored.
     """
     inputs = [function.sparsity_in(i) for i in range(function.n_in())]
     outputs = [function.sparsity_out(i) for i in range(function.n_out())]
@@ -42,14 +42,14 @@ def c_source(function: ca.Function, lanes: int = 1, generated: str = "") -> str:
     """Generate the C text of a dense CasADi function: CasADi's C, then the batch drivers.
 
     Args:
-        function: any that CasADi can write as C.
-        generated: its `generated_c`, if that is there already.
-        lanes: 1 for one evaluation at a time; otherwise batches are also evaluated in lanes, as
-            many as given, or for 0 as many as suit the machine that compiles.
+        function: a function that CasADi can write as C.
+        generated: result of `generated_c` for the function; '' to generate it.
+        lanes: 1 for one evaluation at a time; otherwise the number of lanes in which batches are
+            evaluated, 0 for the width of the machine that compiles.
 
     Raises:
         CodegenError: CasADi cannot write this function as C (a callback, an external solver), or
-            it has no form in lanes.
+            its C cannot be translated to lanes.
     """
     include = "#include <math.h>\n"
     generated, signature = generated or generated_c([function]), Signature.of(function)
@@ -78,14 +78,14 @@ def handwritten_source(
     """Assemble the C text of a function written by hand, with the batch driver.
 
     Args:
-        signature: its name, inputs and outputs.
+        signature: name, inputs and outputs of the function.
         text: C that defines `NAME` with CasADi's interface (arguments, results and work memory by
-            address) and beside it `NAME_work`, `NAME_incref`, `NAME_checkout`, `NAME_release`.
-        helpers: dense CasADi functions that the text calls; their C comes before it.
-        in_pairs: functions that it calls in two lanes, by names of their own.
+            address), and `NAME_work`, `NAME_incref`, `NAME_checkout`, `NAME_release`.
+        helpers: dense CasADi functions that the text calls. Their C is put before the text.
+        in_pairs: functions that the text calls in two lanes, by name.
 
     Raises:
-        CodegenError: CasADi cannot write a helper as C, or it has no form in lanes.
+        CodegenError: CasADi cannot write a helper as C, or its C cannot be translated to lanes.
     """
     include = "#include <math.h>\n"
     generated = generated_c(helpers).replace(include, include + runtime("arithmetic.h"), 1)
@@ -94,11 +94,10 @@ def handwritten_source(
 
 
 def program_source(functions: Mapping[str, ca.Function], own: str, lanes: int = 0) -> str:
-    """Generate the C text of functions in lanes (`_lane_functions`), followed by own C that calls
-    them.
+    """Generate the C text of functions in lanes, followed by own C that calls them.
 
     Raises:
-        CodegenError: CasADi cannot write a function as C, or it has no form in lanes.
+        CodegenError: CasADi cannot write a function as C, or its C cannot be translated to lanes.
     """
     parts = ["#include <math.h>\n#include <stdlib.h>\n#include <string.h>\n"]
     parts += [runtime("arithmetic.h"), *_lanes_header(lanes)]
@@ -111,7 +110,8 @@ def program_source(functions: Mapping[str, ca.Function], own: str, lanes: int = 
 
 
 def _lanes_header(lanes: int) -> list[str]:
-    """Return the types of lanes: the given number, or for 0 the machine's."""
+    """Return the C types of lanes, for the given number of lanes or, for 0, the width of the
+    machine."""
     width = f"#define DUAL_ARM_LANES {lanes}\n" if lanes else ""
     return [runtime("one_lane.h"), width, runtime("lanes.h")]
 
@@ -136,14 +136,14 @@ def _lane_functions(functions: Mapping[str, ca.Function]) -> Iterator[str]:
 
 
 SHARED_SUFFIX = "_numbers"
-"""End of the names of inputs that have one value for all evaluations of a batch."""
+"""Ending of the names of inputs with one value for all evaluations of a batch."""
 
 
 def shared_inputs(function: ca.Function) -> tuple[int, ...]:
-    """Return the inputs that a function in lanes takes as plain numbers.
+    """Return the indices of the inputs that a function in lanes takes as plain numbers.
 
-    These are the inputs of straight functions with the `SHARED_SUFFIX`; other functions pass
-    arguments on, in lanes.
+    These are the inputs of straight functions whose name ends in `SHARED_SUFFIX`. Other functions
+    pass their arguments on in lanes.
     """
     straight = function.is_a("SXFunction")
     names = enumerate(function.name_in())
@@ -168,7 +168,8 @@ def generated_c(functions: Sequence[ca.Function]) -> str:
 
 
 def _filled(driver: str, signature: Signature, generated: str = "") -> str:
-    """Fill a driver with a function's names and sizes, and whether its C keeps state."""
+    """Fill the placeholders of a driver with a function's names and sizes, and whether its C keeps
+    state."""
     inputs = [prod(shape) for shape in signature.input_shapes]
     outputs = [prod(shape) for shape in signature.output_shapes]
     return (
@@ -183,8 +184,8 @@ def _filled(driver: str, signature: Signature, generated: str = "") -> str:
 def operations(function: ca.Function, left_out: frozenset[str] = frozenset()) -> int:
     """Count the instructions that one evaluation runs.
 
-    Nested calls count with all their instructions, as often as they run, both branches of a
-    choice as well; an instruction on a whole vector counts once.
+    Nested calls count with all their instructions, as often as they run. Both branches of a choice
+    count. An instruction on a whole vector counts once.
 
     Args:
         left_out: names of functions that do not count.

@@ -1,7 +1,7 @@
-"""Objects as text, and in a notebook as their figures next to a picture.
+"""Text of objects for print; in a notebook their figures next to a picture.
 
-A carry stands beside its normal forces, a front's points before the search's candidates, a timing's
-use of its limits beside the carry under it.
+The picture of a carry shows its normal forces, that of a front its points and the search's
+candidates, that of a timing the forces of its carry.
 """
 
 from __future__ import annotations
@@ -30,10 +30,11 @@ from symbolic.array import Array
 from symbolic.records import Workcell
 
 MAX_CLOUD = 1500
-"""Feasible candidates behind a front."""
+"""Largest number of feasible candidates that are drawn behind a front."""
 
 ONE_WAY = 1e-6
-"""Share by which what a raised and a lowered number change may differ and count as one slope."""
+"""The effects of raising and of lowering a number count as one slope if they differ by at most this
+share."""
 
 
 def text_of(shown: object) -> str:
@@ -42,7 +43,7 @@ def text_of(shown: object) -> str:
 
 
 def html_of(shown: object) -> str:
-    """Format an object for a notebook: its figures, or else its own text, and its picture."""
+    """Format an object for a notebook: its figures, or its text if it has none, and its picture."""
     if isinstance(shown, Job | Recommendation):
         return f"<div><pre>{html.escape(repr(shown))}</pre>{picture_of(shown)}</div>"
     heading = html.escape(heading_of(shown))
@@ -57,13 +58,13 @@ def heading_of(shown: object) -> str:
 
 @singledispatch
 def figures_of(shown: object) -> dict[str, str]:
-    """Return its figures by name, with units."""
+    """Return the figures of an object by name, with units."""
     raise NotImplementedError(f"{type(shown).__name__} has no display")
 
 
 @singledispatch
 def picture_of(shown: object) -> str:
-    """Draw a picture of it as HTML, '' for none."""
+    """Draw a picture of an object as HTML; '' if it has none."""
     raise NotImplementedError(f"{type(shown).__name__} has no display")
 
 
@@ -114,7 +115,7 @@ def _(job: Job) -> str:
 
 
 def _forces(workcell: Workcell, time: Array, force: Array, title: str, *more: Series) -> str:
-    """Plot forces (n, 2) of both arms over time (n,), and more series."""
+    """Plot forces (n, 2) of both arms over times (n,) [s], with further series."""
     series = [
         Series(robot.name, np.column_stack([time, force[:, i]]), ARM_COLOURS[i])
         for i, robot in enumerate(workcell.robots)
@@ -128,7 +129,7 @@ def _(found: Recommendation) -> str:
 
 
 def _torques(uses: Array) -> str:
-    """Format uses of torques [%]."""
+    """Format utilisations of torques in percent."""
     return ", ".join(map(torque_use, uses.tolist()))
 
 
@@ -183,7 +184,7 @@ def _(front: Front) -> str:
 
 
 def _nearest(cloud: Array, points: Array) -> Array:
-    """Return the candidates around a front's only point, to be drawn behind it."""
+    """Return the candidates closest to the only point of a front, to be drawn behind it."""
     if len(points) > 1 or len(cloud) == 0:
         return np.empty((0, 2))
     distance = np.abs(cloud - points[0]).max(axis=1)
@@ -254,7 +255,7 @@ PLOT_SIZE = (5.4, 3.4)
 """Size of a plot [inch]."""
 
 PLOT_MARGIN = 0.06
-"""Share of the data's range left free around it."""
+"""Margin of a plot around the data, as a share of the data's range."""
 
 ARM_COLOURS = ("#3b6ea8", "#a8733b")
 """Colours of the two robots, as in the report."""
@@ -267,11 +268,11 @@ MARKS = {"line": "-", "dots": "o", "cross": "+"}
 
 @dataclass(frozen=True)
 class Series:
-    """A drawn series: points (n, 2) as a line or as marks.
+    """A series of points (n, 2) in a plot, drawn as a line or as marks.
 
     Attributes:
-        label: in the legend, '' for none.
-        points: (n, 2).
+        label: text in the legend, '' for none.
+        points: (n, 2) coordinates.
         colour: CSS colour.
         kind: 'line', 'dots' or 'cross'.
         size: width of the line or radius of the marks [pt].
@@ -285,10 +286,12 @@ class Series:
 
 
 def plot(series: list[Series], x_title: str, y_title: str, focus: Array) -> str:
-    """Draw an SVG picture of the series; those outside of the axes are clipped.
+    """Draw series as an SVG picture. Points outside the axes are clipped.
 
     Args:
-        focus: (n, 2) points that the axes have to hold.
+        series: the series.
+        x_title, y_title: titles of the axes.
+        focus: (n, 2) points that the axes have to include.
     """
     low, high = focus.min(axis=0), focus.max(axis=0)
     room = np.maximum(PLOT_MARGIN * (high - low), 1e-4 * np.maximum(1.0, np.abs(high)))

@@ -26,7 +26,7 @@ from symbolic.geometry.pairs import CellGeometry, build_geometry
 def scene_data(
     geometry: CellGeometry, carry: Carry, marked: Collection[str] = ()
 ) -> dict[str, Any]:
-    """Return shapes, joints and a good viewpoint, as JSON values.
+    """Return the shapes of a cell, its joints along a carry, and a good viewpoint, as JSON values.
 
     Args:
         marked: names of bodies that are shown in red.
@@ -59,7 +59,8 @@ def scene_data(
 
 
 THREE, PLOTLY = "vendor/three.min.js", "vendor/plotly-basic.min.js"
-"""What `scene.js` needs before it, and what draws points, lines and bars; with licence lines."""
+"""Scripts that `scene.js` needs, and the script that draws points, lines and bars; with licence
+lines."""
 
 
 def asset(name: str) -> str:
@@ -68,7 +69,7 @@ def asset(name: str) -> str:
 
 
 def embedded_json(document: Any) -> str:
-    """Write JSON for a script element: no text in it can end the element or open another."""
+    """Write JSON for a script element. No text in the JSON can end the element or open another."""
     text = json.dumps(document, allow_nan=False, separators=(",", ":"))
     for letter in "<>&\u2028\u2029":
         text = text.replace(letter, f"\\u{ord(letter):04x}")
@@ -76,7 +77,7 @@ def embedded_json(document: Any) -> str:
 
 
 def packed(values: NDArray[Any], kind: type[np.generic]) -> str:
-    """Encode little-endian numbers in base64."""
+    """Encode numbers as little-endian bytes in base64."""
     return base64.b64encode(
         np.ascontiguousarray(values, dtype=np.dtype(kind).newbyteorder("<")).tobytes()
     ).decode("ascii")
@@ -95,7 +96,7 @@ def _solid(solid: Solid, marked: bool) -> dict[str, Any]:
 
 
 MAX_SAMPLES = 200
-"""Samples of a carry that are played."""
+"""Largest number of samples of a carry that are played."""
 
 
 @dataclass(frozen=True)
@@ -103,7 +104,7 @@ class Look:
     """The first view of a carry.
 
     Attributes:
-        sample: number of the sample.
+        sample: index of the sample.
         text: caption of the view.
         bodies: names of the bodies that are shown in red.
     """
@@ -115,12 +116,12 @@ class Look:
 
 @dataclass(frozen=True, repr=False)
 class CarryView:
-    """A self-contained page that plays a carry; drag orbits, right-drag pans, the wheel zooms.
+    """A self-contained page that plays a carry. Drag orbits, right-drag pans, the wheel zooms.
 
     Attributes:
         carry: the carry.
-        height: of the notebook's cell [px].
-        look: where it begins, None for the first sample.
+        height: height of the notebook's cell [px].
+        look: first view of the page; None for the first sample.
     """
 
     carry: Carry
@@ -128,7 +129,7 @@ class CarryView:
     look: Look | None = None
 
     def page(self) -> str:
-        """Write the page's text: no network, nothing but its own scripts."""
+        """Return the text of the page. It needs no network and contains all its scripts."""
         carry = self.carry
         rows = np.unique(np.linspace(0, len(carry) - 1, min(len(carry), MAX_SAMPLES)).astype(int))
         columns = [carry.time[:, None] - carry.time[0], carry.pose, carry.q]

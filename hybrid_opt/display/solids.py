@@ -1,7 +1,7 @@
 """The bodies of a cell as triangle meshes, and their poses along a carry.
 
-Meshes of simple shapes are made here: trimesh, which reads those of files, takes longer to start
-than a picture takes.
+Meshes of simple shapes are made here. trimesh, which reads mesh files, takes longer to start than
+drawing a picture.
 """
 
 from __future__ import annotations
@@ -25,19 +25,20 @@ SECTIONS = 24
 """Facets around a cylinder."""
 
 GROUND_SIZE = 2.5
-"""Fixed bodies at least this long and wide are ground: drawn behind everything [m]."""
+"""Fixed bodies that are at least this long and wide count as ground and are drawn behind everything
+[m]."""
 
 
 @dataclass(frozen=True)
 class Solid:
-    """A body as triangles in the frame that it is fixed to.
+    """A body as triangles in the frame to which it is fixed.
 
     Attributes:
-        name, group: of the collision body.
-        frame: the frame that it is fixed to.
+        name, group: name and group of the collision body.
+        frame: frame to which the body is fixed.
         vertices: (n, 3) [m].
-        faces: (m, 3) indices, outward.
-        is_ground: whether it is a large fixed plate.
+        faces: (m, 3) indices of vertices, with outward normals.
+        is_ground: whether the body is a large fixed plate.
     """
 
     name: str
@@ -73,7 +74,7 @@ def _triangles(seen: CacheKey) -> Solid:
 
 
 def _mesh(shape: ConvexShape) -> tuple[Array, NDArray[np.int64]]:
-    """Compute vertices (n, 3) in the shape's own frame and faces (m, 3), outward."""
+    """Compute vertices (n, 3) in the frame of the shape, and faces (m, 3) with outward normals."""
     match shape:
         case Box():
             return box_corners(shape.size), _BOX_FACES
@@ -99,12 +100,12 @@ _BOX_FACES = np.array(
         *([5, 7, 1], [3, 7, 2], [6, 4, 2], [2, 7, 6], [6, 5, 4], [7, 5, 6]),
     ]
 )
-"""Of the corners of `box_corners`."""
+"""Faces of a box as indices of the corners of `box_corners`."""
 
 
 def _revolved(across: Array, along: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Compute the mesh of a curve turned about z, from its lower to its upper end, both on the
-    axis: its distances (n,) from z and places (n,) along it [m]."""
+    """Compute the mesh of a curve rotated about z. The curve is given by distances (n,) from z and
+    positions (n,) along z [m], from its lower to its upper end, both on the axis."""
     rings, angles = len(across) - 2, np.linspace(0.0, 2.0 * np.pi, SECTIONS + 1)[:-1]
     circle = np.column_stack([np.cos(angles), np.sin(angles), np.ones(SECTIONS)])
     scales = np.column_stack([across, across, along])[1:-1]
@@ -123,7 +124,8 @@ def _revolved(across: Array, along: Array) -> tuple[Array, NDArray[np.int64]]:
 
 
 def joint_placements(arm: ArmGeometry, q: Array) -> Array:
-    """Compute an arm's joint frames (n, n_joints, 4, 4) in the world at joints q (n, n_joints)."""
+    """Compute the joint frames (n, n_joints, 4, 4) of an arm in the world at joint positions q (n,
+    n_joints)."""
     placed = np.empty((*q.shape, 4, 4))
     T = np.broadcast_to(arm.T_world_root, (len(q), 4, 4))
     for j in range(q.shape[1]):
@@ -139,8 +141,13 @@ def joint_placements(arm: ArmGeometry, q: Array) -> Array:
 
 
 def frame_placements(geometry: CellGeometry, pose: Array, q: Array) -> dict[Frame, Array]:
-    """Compute the pose (n, 4, 4) of every frame in the world along n samples: pose (n, 6), q (n,
-    all joints)."""
+    """Compute the pose (n, 4, 4) of every frame in the world at n samples.
+
+    Args:
+        geometry: bodies of the cell.
+        pose: (n, 6) box poses [m, rad].
+        q: (n, all joints) joint positions [rad].
+    """
     placed = {
         Frame("world"): np.broadcast_to(np.eye(4), (len(pose), 4, 4)),
         Frame("box"): box_placement(geometry.workcell.task.orientation, pose),
@@ -157,10 +164,14 @@ def frame_placements(geometry: CellGeometry, pose: Array, q: Array) -> dict[Fram
 def extent_points(
     geometry: CellGeometry, solids: tuple[Solid, ...], pose: Array, q: Array
 ) -> Array:
-    """Compute the corners (k, 3) of every solid's own bounding box at n samples, the ground left
-    out.
+    """Compute the corners (k, 3) [m] of the bounding boxes of all solids at n samples, without the
+    ground. A picture that shows these points shows the whole scene.
 
-    They frame what a picture has to show: pose (n, 6), q (n, all joints).
+    Args:
+        geometry: bodies of the cell.
+        solids: the solids.
+        pose: (n, 6) box poses [m, rad].
+        q: (n, all joints) joint positions [rad].
     """
     placed = frame_placements(geometry, pose, q)
     points = []
@@ -176,14 +187,17 @@ def extent_points(
 
 
 _VIEWED = 12
-"""Approximate number of a carry's samples by which the viewpoint of its scene is chosen."""
+"""Approximate number of samples of a carry from which the viewpoint of a scene is chosen."""
 
 
 def motion_points(geometry: CellGeometry, pose: Array, q: Array, moving: bool = False) -> Array:
-    """Return points (k, 3) that a picture of a whole motion has to show, see `extent_points`.
+    """Return points (k, 3) [m] that a picture of a whole motion has to show.
 
     Args:
-        moving: whether only arms and payload count.
+        geometry: bodies of the cell.
+        pose: (n, 6) box poses [m, rad].
+        q: (n, all joints) joint positions [rad].
+        moving: True if only arms and payload count.
     """
     every = slice(None, None, max(1, len(pose) // _VIEWED))
     solids = cell_solids(geometry)

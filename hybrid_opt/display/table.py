@@ -1,4 +1,4 @@
-"""Tables of texts in every form, and the format of quantities in all of them."""
+"""Tables of texts in several formats, and the number format of quantities in all of them."""
 
 from __future__ import annotations
 
@@ -12,44 +12,45 @@ from dataclasses import dataclass
 from hybrid_opt.store.files import csv_text
 
 LONGEST_CELL = 30
-"""Characters of a cell from which on it takes several lines."""
+"""A cell with more characters takes several lines."""
 
 NOTHING = "–"
-"""Text of a missing figure."""
+"""Text in place of a missing figure."""
 
 TERMINAL_WIDTH = 100
-"""Characters of a line of text in a terminal."""
+"""Number of characters on a line in a terminal."""
 
 
 def number(value: float | None, digits: int = 2, scale: float = 1.0) -> str:
-    """Format a figure; `NOTHING` for None."""
+    """Format a figure times `scale` with so many digits; `NOTHING` for None."""
     if value is None or not math.isfinite(value):
         return NOTHING
     return f"{value * scale:z.{digits}f}"
 
 
 UNPUBLISHED = "unknown"
-"""Cell of an unpublished figure."""
+"""Text in place of a figure that the robot's maker does not publish."""
 
 
 def torque_use(use: float | None) -> str:
-    """Format a use of joint torques [%]; `UNPUBLISHED` for zero, the use of unknown limits."""
+    """Format a utilisation of joint torques in percent; `UNPUBLISHED` for zero, the utilisation of
+    unknown limits."""
     return UNPUBLISHED if use == 0.0 else number(use, 1, 100.0)
 
 
 def counted(count: int, noun: str) -> str:
-    """Format a number of things; the plural of the noun ends in s."""
+    """Format a number with a noun, such as '1 point' and '3 points'. The plural adds an s."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 @dataclass(frozen=True)
 class Quantity:
-    """Format of a quantity in tables, figures and pages.
+    """Number format of a quantity in tables, figures and pages.
 
     Attributes:
-        name, unit: of its column; a pure number has the unit ''.
-        digits: behind the point.
-        scale: from its value in SI units to that in print.
+        name, unit: name and unit of its column; '' for the unit of a pure number.
+        digits: number of digits after the decimal point.
+        scale: factor from the value in SI units to the printed value.
     """
 
     name: str
@@ -58,7 +59,7 @@ class Quantity:
     scale: float = 1.0
 
     def heading(self, whose: str = "") -> str:
-        """Format the heading of a column: the name, its owner, and the unit."""
+        """Format the heading of a column: the name, the owner `whose`, and the unit."""
         named = f"{self.name}, {whose}" if whose else self.name
         return f"{named} [{self.unit}]" if self.unit else named
 
@@ -71,8 +72,7 @@ class Quantity:
         return f"{self(mean)} ± {self(std)}"
 
     def spread(self, middle: float, low: float, high: float) -> str:
-        """Format a value in the middle and the range around it, the value alone if they are
-        equal."""
+        """Format a middle value with the range around it; the value alone if the range is empty."""
         if low == high or not math.isfinite(middle):
             return self(middle)
         return f"{self(middle)} [{self(low)}, {self(high)}]"
@@ -83,10 +83,10 @@ class Table:
     """A table of texts.
 
     Attributes:
-        name: of its files, without suffix.
-        title: above it.
-        header, rows: cells; the first column names the row.
-        note: below it.
+        name: name of the table's files, without suffix.
+        title: title above the table.
+        header, rows: cells. The first column names the row.
+        note: note below the table.
     """
 
     name: str
@@ -97,7 +97,8 @@ class Table:
 
     @property
     def words(self) -> tuple[bool, ...]:
-        """Per column, True if it holds words, which are flush left; others hold figures."""
+        """For each column True if it contains words, which are flush left. Columns of figures are
+        flush right."""
         columns = zip(*self.rows, strict=True) if self.rows else [()] * len(self.header)
         return tuple(k == 0 or not any(map(_is_figure, column)) for k, column in enumerate(columns))
 
@@ -152,11 +153,11 @@ class Table:
 
 
 def text_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> str:
-    """Format rows in columns with a line below the first one, the head.
+    """Format rows in columns, with a line below the first row, the head.
 
     Args:
-        rows: cells; the rows are equally long.
-        left: columns that are flush left; the others are flush right.
+        rows: rows of cells, all of equal length.
+        left: indices of columns that are flush left; the others are flush right.
     """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = [
@@ -170,13 +171,13 @@ def text_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> s
 
 
 def lines(figures: Mapping[str, str]) -> list[str]:
-    """Format one line per figure, values aligned."""
+    """Format one line per figure, with aligned values."""
     width = max((len(name) for name in figures), default=0)
     return [f"  {name:<{width}}  {value}" for name, value in figures.items()]
 
 
 def figures_html(figures: Mapping[str, str]) -> str:
-    """Format an HTML table of two columns."""
+    """Format figures as an HTML table of two columns."""
     rows = "".join(
         f'<tr><th style="text-align:left">{html.escape(name)}</th>'
         f'<td style="text-align:left">{html.escape(value)}</td></tr>'
@@ -186,7 +187,7 @@ def figures_html(figures: Mapping[str, str]) -> str:
 
 
 def _is_figure(cell: str) -> bool:
-    """Return True if a cell is a figure, with its unit or spread."""
+    """Return True if a cell is a figure, possibly with a unit or a spread."""
     return len(cell) <= LONGEST_CELL and re.match(r"[-+\N{MINUS SIGN}]?\.?\d", cell) is not None
 
 
