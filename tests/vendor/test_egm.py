@@ -27,7 +27,7 @@ from hybrid_opt.extras.bundles import BundleOptions
 from hybrid_opt.extras.bundles.bundle import prepared
 from hybrid_opt.extras.bundles.egm import egm_files
 from hybrid_opt.extras.bundles.job_file import Contents
-from hybrid_opt.extras.bundles.programs.carry_job import SLOW
+from hybrid_opt.extras.bundles.programs.carry_machine import SLOW
 from hybrid_opt.store.bundle_file import write_bundle
 from symbolic.array import Array
 from tests.hybrid_opt.extras.bundles.bundles import DRIVER, driven

@@ -19,8 +19,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybrid_opt.extras.bundles.arms import SECTION_OF_EACH, SEVEN, SIX, comment
-from hybrid_opt.extras.bundles.job_file import Export, job_text, pad_jacobians
-from hybrid_opt.extras.bundles.programs import filled, program
+from hybrid_opt.extras.bundles.job_file import Export, pad_jacobians, programs
+from hybrid_opt.extras.bundles.programs import filled
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
@@ -174,9 +174,8 @@ def egm_files(export: Export) -> dict[str, str | bytes]:
     tasks = tasks_of(export)
     modules = {f"{tasks[arm]}/CarryEgm{arm + 1}.mod": _egm_module(export, arm) for arm in (0, 1)}
     return {
-        "job.json": job_text(export),
         "config/egm.json": json.dumps(config, allow_nan=False) + "\n",
-        **{name: program(name) for name in ("run_egm.py", "carry_job.py")},
+        **programs(export, "run_egm.py"),
         **modules,
     }
 

@@ -28,6 +28,7 @@ from scipy.interpolate import BPoly
 from hybrid_opt.compiled_cell import cache_by_workcell
 from hybrid_opt.errors import JobError
 from hybrid_opt.extras.bundles.arms import prefixes
+from hybrid_opt.extras.bundles.programs import program
 from hybrid_opt.extras.bundles.programs.carry_job import FORMAT, VERSION, Limits
 from hybrid_opt.job.compliance import (
     TRACKED,
@@ -286,7 +287,7 @@ LEAST_BAND, MOST_BAND = 0.05, 0.3
 
 REACTION = 0.07
 """From the look at which an arm is wrong to when the other one leaves its course [s]: two looks
-more, and the time of a message (`STRIKES` of carry_job.py, `PERIOD` and `LEAD_OF_STOP` of
+more, and the time of a message (`STRIKES` of carry_machine.py, `PERIOD` and `LEAD_OF_STOP` of
 run_job.py)."""
 
 SILENCE = 0.1
@@ -577,3 +578,12 @@ class Export:
 def job_text(export: Export) -> str:
     """Return the text of job.json."""
     return json.dumps(export.document, allow_nan=False, separators=(",", ":")) + "\n"
+
+
+SHARED = ("carry_job.py", "carry_machine.py")
+"""Programs of every bundle whose arms a program supervises."""
+
+
+def programs(export: Export, name: str) -> dict[str, str | bytes]:
+    """Return a job with the program of a name that runs it, and those that this one imports."""
+    return {"job.json": job_text(export)} | {each: program(each) for each in (name, *SHARED)}

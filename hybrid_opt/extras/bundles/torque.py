@@ -43,7 +43,7 @@ from hybrid_opt.extras.bundles.arms import (
     require_arms,
     ros_joints,
 )
-from hybrid_opt.extras.bundles.job_file import Export, job_text, pad_jacobians
+from hybrid_opt.extras.bundles.job_file import Export, pad_jacobians, programs
 from hybrid_opt.extras.bundles.programs import filled, program
 from hybrid_opt.job.records import Job
 from symbolic.array import Array
@@ -180,10 +180,8 @@ def torque_files(export: Export) -> dict[str, str | bytes]:
         config["wrench"] = [None, None]
         config["grip"] = [_grip(export, arm) for arm in (0, 1)]
     return {
-        "job.json": job_text(export),
         "config/cell.json": json.dumps(usual | config, indent=1, allow_nan=False) + "\n",
-        "run_job.py": program("run_job.py"),
-        "carry_job.py": program("carry_job.py"),
+        **programs(export, "run_job.py"),
         f"launch/{driver}.launch.py": program("cell.launch.py"),
         **files,
     }

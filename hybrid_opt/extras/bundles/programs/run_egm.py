@@ -31,7 +31,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hybrid_opt.extras.bundles.programs.carry_job import Job, Machine, Refused, Seen
+from hybrid_opt.extras.bundles.programs.carry_job import Job, Refused
+from hybrid_opt.extras.bundles.programs.carry_machine import Machine, Seen
 
 BUNDLE = Path(__file__).resolve().parent
 

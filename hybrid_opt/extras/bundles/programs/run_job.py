@@ -35,7 +35,8 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from hybrid_opt.extras.bundles.programs.carry_job import Job, Machine, Moment, Refused, Seen
+from hybrid_opt.extras.bundles.programs.carry_job import Job, Refused
+from hybrid_opt.extras.bundles.programs.carry_machine import Machine, Moment, Seen
 
 BUNDLE = Path(__file__).resolve().parent
 

@@ -19,7 +19,7 @@ from unittest.mock import patch
 
 from rosbags.typesys import Stores, get_typestore
 
-from hybrid_opt.extras.bundles.job_file import Contents
+from hybrid_opt.extras.bundles.job_file import SHARED, Contents
 from hybrid_opt.store.bundle_file import write_bundle
 from tests.hybrid_opt.extras.bundles.controlled import SUCCEEDED, ControlledCell
 
@@ -311,7 +311,8 @@ def run(
         patch.dict(sys.modules, _modules(world)),
         patch.object(sys, "path", [str(folder), *sys.path]),
     ):
-        sys.modules.pop("carry_job", None)
+        for name in SHARED:
+            sys.modules.pop(Path(name).stem, None)
         spec.loader.exec_module(program)
         vars(program)["signal"] = signals
         prepare(world)

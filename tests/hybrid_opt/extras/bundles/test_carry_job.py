@@ -10,7 +10,8 @@ import pytest
 from scipy.interpolate import CubicHermiteSpline
 
 from hybrid_opt.extras.bundles.job_file import pad_places
-from hybrid_opt.extras.bundles.programs.carry_job import Clock, Job, Machine, Refused, Seen
+from hybrid_opt.extras.bundles.programs.carry_job import Job, Refused
+from hybrid_opt.extras.bundles.programs.carry_machine import Clock, Machine, Seen
 from tests.hybrid_opt.extras.bundles.bundles import exported
 from tests.hybrid_opt.extras.bundles.bundles import read_job as job
 

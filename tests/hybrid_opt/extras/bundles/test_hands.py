@@ -23,7 +23,8 @@ from hybrid_opt.extras.bundles.bundle import prepared
 from hybrid_opt.extras.bundles.job_file import Contents, Export
 from hybrid_opt.extras.bundles.programs import carry_job as programs
 from hybrid_opt.extras.bundles.programs import filled
-from hybrid_opt.extras.bundles.programs.carry_job import Machine, Refused, Seen
+from hybrid_opt.extras.bundles.programs.carry_job import Refused
+from hybrid_opt.extras.bundles.programs.carry_machine import Machine, Seen
 from hybrid_opt.extras.bundles.targets import TORQUE_DRIVERS, missing_for
 from hybrid_opt.extras.bundles.urscript import urscript_files
 from hybrid_opt.job.plan import JobModel

@@ -1,0 +1,434 @@
+"""When the arms of a job have to stop, and how.
+
+A clock drives the coordinate s: at rate 1 the job runs as planned, at rate 0 both arms hold their
+places and press, at rate -1 the job runs backwards, which takes the same forces. Whatever goes
+wrong, the clock stops smoothly: both arms come to rest at the same coordinate and keep the squeeze
+that belongs to it.
+
+Hands that hold by themselves are switched on and off while the arms stand still, and the clock
+waits there until their inputs say the same. Nothing else switches them: after any fault they hold.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from copy import copy
+from dataclasses import dataclass, field
+
+from hybrid_opt.extras.bundles.programs.carry_job import HELD, PRESSED, Job, Refused
+
+STILL = 1e-9
+"""Rates below this are none."""
+
+FINE = 0.002
+"""Longest step over which a changing rate is integrated [s]."""
+
+SLOW = 0.25
+"""Share of the fastest speed below which a posture says too little of the coordinate to call an arm
+late."""
+
+UNLOADED = 0.07
+"""Largest force before the first contact, over the largest commanded one: an offset of the sensor
+becomes an error of the squeeze."""
+
+STRIKES = 3
+"""Consecutive checks with the same fault before a stop; a requested stop acts at once."""
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The path at a time from now [s]: its coordinate, its rate, and the derivative of the rate."""
+
+    time: float
+    s: float
+    rate: float
+    change: float
+
+
+class Clock:
+    """The coordinate of the path and its rate.
+
+    Attributes:
+        s: commanded coordinate of both arms [s].
+        rate: of s over time.
+    """
+
+    def __init__(self, end: float, stop_time: float, s: float = 0.0, rate: float = 0.0) -> None:
+        """Stand at a coordinate, or run through it."""
+        self.s, self.rate, self._stop_time = s, rate, stop_time
+        self._low, self._high = 0.0, end
+        self._takes = stop_time
+        self._from, self._to, self._since = rate, rate, 0.0
+
+    def keep(self, low: float, high: float) -> None:
+        """Keep the coordinate between two from now on [s]."""
+        self._low, self._high = low, high
+
+    @property
+    def turning(self) -> bool:
+        """True if the rate changes."""
+        return self._from != self._to
+
+    def turn(self, rate: float, after: float = 0.0, takes: float | None = None) -> None:
+        """Change the rate smoothly.
+
+        Args:
+            after: when it begins, from now [s].
+            takes: time of a change by one; the stop time by default [s].
+        """
+        if rate != self._to:
+            self._from, self._to, self._since = self.rate, rate, -after
+            self._takes = self._stop_time if takes is None else takes
+
+    def advance(self, dt: float) -> None:
+        """Advance time [s]; the coordinate does not depend on the number of calls."""
+        count = max(1, math.ceil(dt / FINE)) if self.turning else 1
+        for _ in range(count):
+            self._step(dt / count)
+
+    def _step(self, dt: float) -> None:
+        before = self.rate
+        if self.turning:
+            self._since += dt
+            x = self._share
+            smooth = x * x * x * (10.0 + x * (6.0 * x - 15.0))
+            self.rate = self._from + (self._to - self._from) * smooth
+            if x >= 1.0:
+                self.rate = self._from = self._to
+        self.s = min(max(self.s + dt * (before + self.rate) / 2.0, self._low), self._high)
+
+    @property
+    def _share(self) -> float:
+        """Share of the change of the rate that is over."""
+        return min(max(self._since / (self._takes * abs(self._to - self._from)), 0.0), 1.0)
+
+    @property
+    def change(self) -> float:
+        """Derivative of the rate by time [1/s]."""
+        if not self.turning:
+            return 0.0
+        x = self._share
+        sign = 1.0 if self._to > self._from else -1.0
+        return sign * 30.0 * x * x * (1.0 - x) ** 2 / self._takes
+
+    def ahead(self, rate: float, step: float) -> Iterator[Moment]:
+        """Yield each step from now on, turning to a rate, until it stands or has to."""
+        clock = copy(self)
+        clock.turn(rate)
+        yield Moment(0.0, clock.s, clock.rate, clock.change)
+        last = self._high if rate > 0.0 else self._low
+        count = 0
+        while clock.turning or (abs(clock.rate) > STILL and clock.s != last):
+            clock.advance(step)
+            count += 1
+            yield Moment(count * step, clock.s, clock.rate, clock.change)
+
+
+@dataclass
+class Seen:
+    """Measured state of the arms at a moment.
+
+    Attributes:
+        q: measured joint positions of each arm; None if unknown [rad, m].
+        force: measured normal force of each pad; None if not measured [N].
+        age: time since each arm's posture was measured [s].
+        grip: input of each arm's hands: they hold; None if unknown.
+        fault: reason to stop; '' for none.
+        lost: the reason is an arm that does not follow its commands.
+    """
+
+    q: list[list[float] | None] = field(default_factory=lambda: [None, None])
+    force: list[float | None] = field(default_factory=lambda: [None, None])
+    age: list[float] = field(default_factory=lambda: [0.0, 0.0])
+    grip: list[bool | None] = field(default_factory=lambda: [None, None])
+    fault: str = ""
+    lost: bool = False
+
+
+class Machine:
+    """Runs a job: `ready`, `running`, `stopping`, `held`, `done`; `landing` stops where the box
+    stands before the end of its set-down, and goes on with the release there.
+
+    Attributes:
+        state: one of these.
+        reason: why it stopped last.
+        clock: of the path.
+        stop_time: of the stop that runs, or of the last one [s].
+        opened: the last look found that hands do what they were told, so that the clock goes on.
+    """
+
+    def __init__(
+        self,
+        job: Job,
+        lag: float = 0.0,
+        lead: float = 0.0,
+        sensors: Sequence[bool] = (False, False),
+        inputs: Sequence[bool] = (False, False),
+    ) -> None:
+        """Begin at the start of the job, at rest.
+
+        Args:
+            lag: delay of the arms behind their commands [s].
+            lead: time from the decision to stop to its effect on the commands [s].
+            sensors: per arm, True if its force has to be measured.
+            inputs: per arm, True if something has to tell whether its hands hold.
+        """
+        self.job, self.lag, self.lead, self._sensors = job, lag, lead, sensors
+        self.state, self.reason = "ready", ""
+        self.clock, self.stop_time = Clock(job.end, job.limits.stop_time), job.limits.stop_time
+        self._strikes, self._silent = 0, list[str]()
+        self._inputs, self._gates, self._waited = inputs, list[float](), 0.0
+        self._direction, self.opened = 1.0, False
+
+    def start(self, seen: Seen) -> None:
+        """Begin the job.
+
+        Raises:
+            Refused: a stop is requested, an arm is silent or not at its first place, a sensor gives
+                no reading, or a pad is pressed.
+        """
+        self.check(seen)
+        self.state = "running"
+        self.clock = Clock(self.job.end, self.job.limits.stop_time, 0.0, 1.0)
+        self._aim(1.0)
+
+    def check(self, seen: Seen) -> None:
+        """Refuse arms that are not ready for the job; see `start`."""
+        if seen.fault:
+            raise Refused(seen.fault)
+        self._require_places(seen, self.job.limits.start)
+        for arm, force in enumerate(seen.force):
+            if self._sensors[arm] and force is None:
+                raise Refused(self._no_force(arm))
+            if self._inputs[arm] and seen.grip[arm] is not False:
+                raise Refused(f"{self._grip(arm, seen)} before they are at the box")
+            most = UNLOADED * max(self.job.robots[arm]["normal_force"])
+            if force is not None and abs(force) > most:
+                raise Refused(
+                    f"{self._name(arm)} feels {force:.1f} N before it touches the box: zero its "
+                    f"sensor and state its tool_load; allowed are {most:.1f} N"
+                )
+
+    def hold(self, reason: str) -> None:
+        """Hold the present commanded posture, because the arms cannot go on."""
+        self.clock = Clock(self.job.end, self.job.limits.stop_time, self.clock.s)
+        self.state, self.reason = "held", reason
+
+    def resume(self, direction: float, seen: Seen) -> None:
+        """Resume from a hold: 1 to the end of the job, -1 back to its beginning.
+
+        Raises:
+            Refused: it is not held, an arm is silent or not where it is held.
+        """
+        if self.state != "held":
+            raise Refused(f"the job is {self.state}; it goes on only from where it is held")
+        if direction < 0.0 and self.job.is_standing:
+            raise Refused("the box stands: 'continue' lets go of it")
+        if seen.fault:
+            raise Refused(seen.fault)
+        self._require_places(seen, self.job.limits.path)
+        self.state, self._strikes = "running", 0
+        self._aim(direction)
+        self.clock.turn(direction)
+
+    @property
+    def grip(self) -> bool:
+        """True if the outputs of hands have to be on, once the job has begun."""
+        return self.job.grips(self.clock.s, self._direction)
+
+    def _aim(self, direction: float) -> None:
+        """Set the places ahead at which the clock has to wait for the inputs of hands."""
+        self._direction, s, found = direction, self.clock.s, self.job.switches
+        gates = [switch.end for switch in found if switch.end >= s]
+        if direction < 0.0:
+            gates = [switch.begin for switch in reversed(found) if switch.begin <= s]
+        self._gates = gates if any(self._inputs) else []
+        self._next_gate()
+
+    def _next_gate(self) -> None:
+        """Let the clock go as far as the next of these places."""
+        self._waited = 0.0
+        low, high = 0.0, self.job.end
+        if self._gates and self._direction > 0.0:
+            high = self._gates[0]
+        elif self._gates:
+            low = self._gates[0]
+        self.clock.keep(low, high)
+
+    def _wait(self, dt: float, seen: Seen) -> None:
+        """Wait for hands where the clock has to; go on when all that tell anything agree."""
+        if self.clock.turning or self._gates[:1] != [self.clock.s]:
+            return
+        self._waited += dt
+        told = zip(self._inputs, seen.grip, strict=True)
+        late = [arm for arm, (told_of, on) in enumerate(told) if told_of and on is not self.grip]
+        if not late:
+            self._gates.pop(0)
+            self._next_gate()
+            self.opened = True
+        elif self._waited > self.job.limits.grip:
+            self.hold(f"{self._grip(late[0], seen)} after {self.job.limits.grip:g} s")
+
+    def tick(self, dt: float, seen: Seen) -> None:
+        """Advance the time and check the arms."""
+        self.clock.advance(dt)
+        self.opened = False
+        limit = self.job.limits.silence
+        self._silent = [self._name(arm) for arm, age in enumerate(seen.age) if age > limit]
+        if self.state == "running":
+            if not self.clock.turning and (
+                (self.clock.rate > 0.0 and self.clock.s >= self.job.end)
+                or (self.clock.rate < 0.0 and self.clock.s <= 0.0)
+            ):
+                wrong = self._wrong(seen) or self._wrong_force(seen)
+                if wrong:
+                    self.hold(wrong)
+                else:
+                    self.state = "done"
+                return
+            wrong, force = self._wrong(seen), self._wrong_force(seen)
+            self._strikes = self._strikes + 1 if wrong or force else 0
+            if seen.fault or self._strikes >= STRIKES:
+                if not (seen.fault or wrong) and self.clock.rate > 0.0 and self._lands(force):
+                    return
+                self.stop(seen.fault or wrong or force, quick=seen.lost or not seen.fault)
+            else:
+                self._wait(dt, seen)
+        elif self.state == "stopping" and not self.clock.turning:
+            self.state = "held"
+        elif self.state == "landing" and not self.clock.turning:
+            self.job.stand(self.clock.s, seen.q)
+            self.clock = Clock(self.job.end, self.job.limits.stop_time, self.job.begin("release"))
+            self.state = "held"
+            try:
+                self.resume(1.0, seen)
+            except Refused as error:
+                self.hold(str(error))
+
+    def _lands(self, force: str) -> bool:
+        """Return True if a wrong force in the last part of the set-down means that the box stands;
+        stop there, unless the release begins sooner."""
+        if not self.job.is_touching(self.clock.s):
+            return False
+        takes = self.job.limits.quick_stop
+        if self.clock.s + self.lead + takes / 2.0 < self.job.begin("release"):
+            self.state, self.reason, self.stop_time = "landing", force, takes
+            self.clock.turn(0.0, self.lead, takes)
+        return True
+
+    def stop(self, reason: str, quick: bool = False) -> None:
+        """Stop along the path and hold; quickly if an arm does not follow its commands."""
+        if self.state == "running":
+            self.state, self.reason = "stopping", reason
+            limits = self.job.limits
+            self.stop_time = limits.quick_stop if quick else limits.stop_time
+            self.clock.turn(0.0, self.lead, self.stop_time)
+
+    def told(self) -> str:
+        """Describe the state, and how to go on."""
+        where = f"{self.job.phase(self.clock.s)}, {self.clock.s:.3f} s"
+        if self.state == "landing":
+            return f"the box stands in {where}: {self.reason}. Both arms let go of it there"
+        if self.state in ("stopping", "held"):
+            known = (
+                f"{' and '.join(self._silent)} is silent: look whether it still holds"
+                if self._silent
+                else f"Both arms report and are commanded to hold their places and {self._keeps}"
+            )
+            return (
+                f"{self.state} in {where}: {self.reason}. {known}. To set the box down: 'continue' "
+                "to the end of the job, or 'back' to where the box stood"
+            )
+        return f"{self.state} ({where})"
+
+    @property
+    def _keeps(self) -> str:
+        if not self.job.switches:
+            return "press"
+        return f"keep their hands switched {'on' if self.grip else 'off'}"
+
+    def _grip(self, arm: int, seen: Seen) -> str:
+        """Tell what the input of an arm's hands says."""
+        if seen.grip[arm] is None:
+            return f"nothing is heard of the input of {self._name(arm)}'s hands"
+        return f"the hands of {self._name(arm)} {'hold' if seen.grip[arm] else 'do not hold'}"
+
+    def _name(self, arm: int) -> str:
+        return str(self.job.robots[arm]["name"])
+
+    def _require_places(self, seen: Seen, most: float) -> None:
+        for arm, q in enumerate(seen.q):
+            if q is None or seen.age[arm] > self.job.limits.silence:
+                raise Refused(self._no_news(arm, seen))
+            away = self.job.distance(arm, q, self.clock.s)
+            if away > most:
+                raise Refused(
+                    f"the pad of {self._name(arm)} is up to {1e3 * away:.1f} mm from its place, "
+                    f"allowed are {1e3 * most:.1f} mm: move it there first"
+                )
+
+    def _wrong(self, seen: Seen) -> str:
+        """Return the reason not to go on, or ''."""
+        limits, s = self.job.limits, self.clock.s
+        # Nothing is lifted, and no job done, by an arm that stands elsewhere.
+        stands = self.job.is_gripped(s) or s in (0.0, self.job.end)
+        most = limits.path / 2.0 if stands else limits.path
+        coordinates = []
+        direction = 1.0 if self.clock.rate >= 0.0 else -1.0
+        for arm, q in enumerate(seen.q):
+            if seen.age[arm] > limits.silence:
+                return self._no_news(arm, seen)
+            if q is None:
+                continue
+            # Where the arm had to be when its posture was measured.
+            since = self.clock.rate * seen.age[arm]
+            told = s - direction * self.lag - since
+            # Twice as far behind as is allowed, and a little ahead.
+            far, near = -2.0 * direction * limits.behind, direction * limits.behind / 2.0
+            at = self.job.coordinate(arm, q, told, (min(far, near), max(far, near)))
+            away = self.job.distance(arm, q, at)
+            if away > most:
+                return f"{self._name(arm)} has left its path by up to {1e3 * away:.1f} mm"
+            if self.job.speed(arm, s) > SLOW * self.job.fastest:
+                if direction * (told - at) > limits.behind:
+                    late = 1e3 * direction * (told - at)
+                    return f"{self._name(arm)} is {late:.0f} ms behind its reference"
+                coordinates.append(at + since)
+        if len(coordinates) == 2:
+            # What counts is how far the pads are apart: at low speed, time says little.
+            apart = abs(coordinates[0] - coordinates[1])
+            if apart * self.job.speed(0, s) > limits.skew * self.job.fastest:
+                return f"the arms are {1e3 * apart:.0f} ms apart along the path"
+        silent = [a for a in (0, 1) if self._sensors[a] and seen.force[a] is None]
+        return self._no_force(silent[0]) if silent else self._wrong_grip(seen)
+
+    def _wrong_grip(self, seen: Seen) -> str:
+        for arm, on in enumerate(seen.grip):
+            if self._inputs[arm] and (on is None or (self.job.holds(self.clock.s) and not on)):
+                return self._grip(arm, seen)
+        return ""
+
+    def _wrong_force(self, seen: Seen) -> str:
+        """Return what the measured forces say against going on, or ''."""
+        s, lift = self.clock.s, self.job.pressed
+        for arm, measured in enumerate(seen.force):
+            wanted = self.job.force(arm, s)
+            # Before the box is lifted the pads have to press.
+            pressed = s <= lift and wanted >= PRESSED * self.job.force(arm, lift)
+            if not pressed and self.job.phase(s) not in HELD:
+                continue
+            if measured is not None and abs(measured - wanted) > self.job.limits.force * wanted:
+                return f"{self._name(arm)} presses {measured:.1f} N instead of {wanted:.1f} N"
+        return ""
+
+    def _no_news(self, arm: int, seen: Seen) -> str:
+        if seen.q[arm] is None:
+            return f"no news from {self._name(arm)}: is its controller launched?"
+        return (
+            f"no news from {self._name(arm)} for {seen.age[arm]:.2f} s, by the stamps of its joint "
+            "states"
+        )
+
+    def _no_force(self, arm: int) -> str:
+        return f"no force is measured at the pad of {self._name(arm)}: is its sensor published?"
