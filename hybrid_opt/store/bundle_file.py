@@ -15,6 +15,10 @@ from hybrid_opt.store.files import AGAIN, read_bytes, read_document, sha256, sto
 from symbolic.safe_io import replace_file, sync_folder
 
 MANIFEST = "manifest.json"
+
+MEASURED_FILE = "measured.toml"
+"""What a bundle's own bring-up writes beside it; it goes with the bundle."""
+
 BUNDLE_FORMAT = "dual-arm-carry bundle"
 BUNDLE_VERSION = 2
 
@@ -103,7 +107,7 @@ def _require_own(folder: Path) -> None:
         raise ResultsError(f"{found[0]} is in the way of a bundle ({error}); {remedy}") from error
     for path in found:
         name = path.relative_to(folder).as_posix()
-        if name == MANIFEST:
+        if name in (MANIFEST, MEASURED_FILE):
             continue
         if name not in files or path.is_symlink():
             raise ResultsError(f"{path} is no file of this bundle; {remedy}")

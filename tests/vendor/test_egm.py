@@ -30,7 +30,7 @@ from hybrid_opt.extras.bundles.job_file import Contents
 from hybrid_opt.extras.bundles.programs.carry_machine import SLOW
 from hybrid_opt.store.bundle_file import write_bundle
 from symbolic.array import Array
-from tests.hybrid_opt.extras.bundles.bundles import DRIVER, driven
+from tests.hybrid_opt.extras.bundles.bundles import DRIVER, as_planned, driven
 from tests.hybrid_opt.extras.bundles.bundles import read_job as job
 from tests.hybrid_opt.extras.bundles.test_abb import CYCLE, STIFFNESS, gap
 from tests.hybrid_opt.job.jobs import rack_job
@@ -42,6 +42,9 @@ LONGEST = 60.0
 
 LAG = 0.028
 """With which both arms follow [s]."""
+
+SIGN = -1.0
+"""Of what the sensors read when the pads press."""
 
 TRACKED = 0.10
 """Allowed error of the forces in the carry, over the commanded ones."""
@@ -67,7 +70,7 @@ class Controllers:
 
         self._egm = egm_pb2
         files = bundle()
-        write_bundle(folder, files, {})
+        write_bundle(folder, as_planned(files, SIGN), {})
         config = json.loads(files["config/egm.json"])
         self._targets = [("127.0.0.1", port) for port in config["ports"]]
         self._sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in self._targets]
@@ -127,7 +130,7 @@ class Controllers:
         message.mciState.state = self._egm.EgmMCIState.MCI_RUNNING
         felt = force + (self.offset if arm == self._pressing else 0.0)
         message.measuredForce.fcActive = True
-        message.measuredForce.force.extend([0.0, 0.0, -felt, 0.0, 0.0, 0.0])
+        message.measuredForce.force.extend([0.0, 0.0, SIGN * felt, 0.0, 0.0, 0.0])
         return bytes(message.SerializeToString())
 
     def _receive(self, own: socket.socket) -> Array | None:

@@ -22,7 +22,7 @@ import pytest
 
 from hybrid_opt.store.bundle_file import write_bundle
 from symbolic.array import Array
-from tests.hybrid_opt.extras.bundles.bundles import contents
+from tests.hybrid_opt.extras.bundles.bundles import as_planned, contents
 from tests.hybrid_opt.extras.bundles.bundles import read_job as job
 from tests.vendor.ros_environment import ENVIRONMENT, PYTHON
 
@@ -142,7 +142,8 @@ def run(
     """
     files = dict(contents("torque", driver))
     config = json.loads(files["config/cell.json"]) | {"simulated": True}
-    write_bundle(folder, files | {"config/cell.json": json.dumps(config)}, {})
+    files |= {"config/cell.json": json.dumps(config)}
+    write_bundle(folder, as_planned(files), {})
     variables = os.environ | {
         "ROS_DOMAIN_ID": str(os.getpid() % 100 + 1),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from hybrid_opt.extras.bundles.arms import SECTION_OF_EACH, SEVEN, SIX, comment
-from hybrid_opt.extras.bundles.job_file import Export, pad_jacobians, programs
+from hybrid_opt.extras.bundles.job_file import Export, pad_jacobians, plan_of, programs
 from hybrid_opt.extras.bundles.programs import filled
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -152,15 +152,17 @@ def egm_files(export: Export) -> dict[str, str | bytes]:
     J = pad_jacobians(export.workcell, follower, export.sampled.arm(follower, q))
     # Along the pad's normal, without turning it.
     way = np.concatenate([robots[follower].T_flange_pad[:3, 2], np.zeros(3)])
-    lag = max(LEAST_LAG, robots[follower].driver.lag)
+    lags = [robot.driver.lag for robot in robots]
+    lag = max(LEAST_LAG, lags[follower])
     assert export.stiffness is not None, "the target requires it"
     compliance = 2.0 / export.stiffness
     time, force = export.sampled.time, export.sampled.normal_force[:, follower]
     force_rate = float((np.abs(np.diff(force)) / np.diff(time)).max())
     config = {
+        "plan": plan_of(export, "abb-egm", "run_egm.py", lags, True),
         "ports": list(PORTS),
         "addresses": [robot.driver.address for robot in robots],
-        "lags": [robot.driver.lag for robot in robots],
+        "lags": lags,
         "sensors": [robot.driver.force_control for robot in robots],
         "press": {
             "arm": follower,

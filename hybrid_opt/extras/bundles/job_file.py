@@ -580,10 +580,33 @@ def job_text(export: Export) -> str:
     return json.dumps(export.document, allow_nan=False, separators=(",", ":")) + "\n"
 
 
-SHARED = ("carry_job.py", "carry_machine.py")
+SHARED = ("bring_up.py", "carry_job.py", "carry_machine.py")
 """Programs of every bundle whose arms a program supervises."""
+
+
+def plan_of(
+    export: Export, target: str, program: str, leads: Sequence[float], presses: bool
+) -> dict[str, Any]:
+    """Return the numbers of the drivers that a bundle was planned for, to be compared with those
+    that its bring-up measures.
+
+    Args:
+        leads: compensated part of each arm's lag [s].
+        presses: a sensor measures how hard a block is pressed.
+    """
+    return {
+        "target": target,
+        "program": program,
+        "leads": list(leads),
+        "presses": presses,
+        "stiffness": export.stiffness if target == "abb-egm" else None,
+        "drivers": [
+            {k: v for k, v in asdict(robot.driver).items() if v is not None}
+            for robot in export.workcell.robots
+        ],
+    }
 
 
 def programs(export: Export, name: str) -> dict[str, str | bytes]:
     """Return a job with the program of a name that runs it, and those that this one imports."""
-    return {"job.json": job_text(export)} | {each: program(each) for each in (name, *SHARED)}
+    return {"job.json": job_text(export), **{each: program(each) for each in (name, *SHARED)}}

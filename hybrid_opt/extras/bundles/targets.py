@@ -148,7 +148,7 @@ _TORQUE = Target(
     TORQUE_STEPS,
     "quintic",
     "start your simulator with description/cell.urdf, ros2 launch launch/simulation.launch.py, "
-    "then python3 run_job.py",
+    "python3 run_job.py --bring-up without a box, then python3 run_job.py",
     RUN,
     "one controller drives all joints: both arms start in the same cycle",
     0.0,
@@ -169,8 +169,8 @@ TORQUE_DRIVERS: Mapping[str, Target] = {
     "simulation": _TORQUE,
     "franka": replace(
         _DRIVEN,
-        how_to_run="no end effector in Desk; ros2 launch launch/franka.launch.py, then python3 "
-        "run_job.py",
+        how_to_run="no end effector in Desk; ros2 launch launch/franka.launch.py, python3 "
+        "run_job.py --bring-up without a box, then python3 run_job.py",
     ),
     "ur": replace(
         _DRIVEN,
@@ -180,7 +180,8 @@ TORQUE_DRIVERS: Mapping[str, Target] = {
             "the number of a digital line, 0 to 17, or by services and topics of ROS, /NAME each",
         ),
         how_to_run="PolyScope 5.25.1 or 10.12.1, no TCP offset; power both arms on and release "
-        "their brakes; ros2 launch launch/ur.launch.py, then python3 run_job.py",
+        "their brakes; ros2 launch launch/ur.launch.py, python3 run_job.py --bring-up without a "
+        "box, then python3 run_job.py",
     ),
 }
 """The torque target by its drivers."""
@@ -193,7 +194,8 @@ TARGETS: Mapping[str, Target] = {
         (0.02, 0.01, 0.005),
         "cubic",
         "load T_ROB1/CarryEgm1.mod and T_ROB2/CarryEgm2.mod, jog both robots to carryFirst, run "
-        "CarryEgm in both tasks, then python3 run_egm.py; first without the box",
+        "CarryEgm in both tasks, python3 run_egm.py --bring-up without a box, then, with CarryEgm "
+        "run again, python3 run_egm.py",
         "run_egm.py streams both arms from one clock and lets it stand still",
         "one clock streams the positions of both arms",
         0.004,

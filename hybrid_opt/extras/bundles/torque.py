@@ -43,7 +43,7 @@ from hybrid_opt.extras.bundles.arms import (
     require_arms,
     ros_joints,
 )
-from hybrid_opt.extras.bundles.job_file import Export, pad_jacobians, programs
+from hybrid_opt.extras.bundles.job_file import Export, pad_jacobians, plan_of, programs
 from hybrid_opt.extras.bundles.programs import filled, program
 from hybrid_opt.job.records import Job
 from symbolic.array import Array
@@ -175,10 +175,15 @@ def torque_files(export: Export) -> dict[str, str | bytes]:
     for values in known:
         for name, entries in json.loads(filled(f"cell_{driver}.json", **values)).items():
             config[name] = config.get(name, []) + entries if isinstance(entries, list) else entries
-    usual = {"simulated": driver == "simulation", "lag": export.lag, "step": export.step}
     if export.job.follower is None:
         config["wrench"] = [None, None]
         config["grip"] = [_grip(export, arm) for arm in (0, 1)]
+    usual = {
+        "plan": plan_of(export, "torque", "run_job.py", (0.0, 0.0), any(config["wrench"])),
+        "simulated": driver == "simulation",
+        "lag": export.lag,
+        "step": export.step,
+    }
     return {
         "config/cell.json": json.dumps(usual | config, indent=1, allow_nan=False) + "\n",
         **programs(export, "run_job.py"),

@@ -260,14 +260,20 @@ class Job:
         return float(sum(r * abs(v) for r, v in zip(reach, rates, strict=True)))
 
     def coordinate(
-        self, arm: int, q: Sequence[float], s: float, window: tuple[float, float]
+        self,
+        arm: int,
+        q: Sequence[float],
+        s: float,
+        window: tuple[float, float],
+        near: float = NEAR,
     ) -> float:
         """Find the coordinate that fits a posture best, among equals the nearest to s [s].
 
         Args:
             window: how far from s it may be, before and behind [s].
+            near: a pad so near to its place at s is there [m].
         """
-        if self.distance(arm, q, s) <= NEAR:
+        if self.distance(arm, q, s) <= near:
             return s
         best, low, high = s, *window
         for step in (4.0 * SEARCH_STEP, SEARCH_STEP, SEARCH_STEP / 8.0, SEARCH_STEP / 64.0):

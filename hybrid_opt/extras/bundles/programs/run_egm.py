@@ -1,4 +1,4 @@
-"""Streams the job to both arms of an ABB cell: python3 run_egm.py [--check]
+"""Streams the job to both arms of an ABB cell: python3 run_egm.py [--check|--in-air|--bring-up]
 
 Start CarryEgm in both tasks first. One clock drives both arms: each message of a controller is
 answered with the arm's commanded position, its lag ahead. The arm that presses is moved along its
@@ -31,6 +31,17 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hybrid_opt.extras.bundles.programs.bring_up import (
+    AIR,
+    BACK,
+    BLOCK,
+    Looks,
+    Measured,
+    add_options,
+    bring_up,
+    require,
+    unloaded,
+)
 from hybrid_opt.extras.bundles.programs.carry_job import Job, Refused
 from hybrid_opt.extras.bundles.programs.carry_machine import Machine, Seen
 
@@ -45,6 +56,9 @@ make the arms jump."""
 
 MOST_PRESSED = 1.2
 """Measured over commanded force beyond which the pad goes no farther into the box."""
+
+CREEP = 0.002
+"""Speed of the pressing pad while it is measured [m/s]."""
 
 CTRL_C = "Ctrl-C"
 
@@ -79,17 +93,30 @@ class Press:
         if felt is not None and felt > MOST_PRESSED * max(wanted, soon):
             # Stiffer than measured, or not where it should be: no farther into it.
             target = min(target, self.way)
-        step = self._speed * dt
+        self._move(target, self._speed * dt)
+
+    def creep(self, dt: float, wanted: float, felt: float) -> None:
+        """Advance the time for an arm of unknown stiffness, by the sign of the error alone."""
+        self._move(self._most if felt < wanted else 0.0, CREEP * dt)
+
+    def _move(self, target: float, step: float) -> None:
         self.way += min(max(target - self.way, -step), step)
 
 
 class Stream:
     """Answers both controllers."""
 
-    def __init__(self, job: Job, config: dict[str, Any]) -> None:
-        """Wait for both controllers."""
+    def __init__(self, job: Job, config: dict[str, Any], known: Sequence[Measured] | Looks) -> None:
+        """Wait for both controllers.
+
+        Args:
+            known: what was measured of the arms, or looks that measure them.
+        """
         self.job, self.config = job, config
-        self.machine = Machine(job, 0.0, sensors=config["sensors"])
+        self.looks = known if isinstance(known, Looks) else None
+        self._signs = None if isinstance(known, Looks) else [each.sign for each in known]
+        sensors = config["sensors"] if self._signs else (False, False)
+        self.machine = Machine(job, 0.0, sensors=sensors)
         self.press = Press(config["press"])
         self.fault, self.command = "", ""
         self._arm: int = config["press"]["arm"]
@@ -113,7 +140,11 @@ class Stream:
             way = self.press.way
             q[self._arm] = [a - way * slope for a, slope in zip(pressing, inward, strict=True)]
         lost = self.fault not in ("", CTRL_C)
-        return Seen(q=q, force=list(self._force), age=age, fault=self.fault, lost=lost)
+        force: list[float | None] = [None, None]
+        if self._signs:
+            both = zip(self._signs, self._force, strict=True)
+            force = [None if raw is None else sign * raw for sign, raw in both]
+        return Seen(q=q, force=force, age=age, fault=self.fault, lost=lost)
 
     def hear(self, arm: int, message: FromRobot, now: float) -> None:
         """Process a message of an arm's controller."""
@@ -125,7 +156,7 @@ class Stream:
         self._news[arm] = now
         if self.config["sensors"][arm] and len(message.force) >= 3:
             # About carryPad, whose z axis is the pad's normal.
-            self._force[arm] = abs(message.force[2])
+            self._force[arm] = message.force[2]
         if self.machine.state == "running" and not message.running:
             name = self.job.robots[arm]["name"]
             self.fault = self.fault or f"the controller of {name} does not follow"
@@ -150,16 +181,23 @@ class Stream:
         before = self.machine.state
         if before == "ready":
             return
-        self.machine.tick(dt, self.seen(now))
+        seen = self.seen(now)
+        self.machine.tick(dt, seen)
         clock = self.machine.clock
         soon = clock.s + clock.rate * self.config["lags"][self._arm]
         wanted, later = (self.job.force(self._arm, s) for s in (clock.s, soon))
-        own, other = self._force[self._arm], self._force[1 - self._arm]
-        # A job that stops may do so because a sensor is wrong: what was integrated stays.
-        felt = None
-        if self.machine.state == "running":
-            felt = own if own is not None else other
-        self.press.tick(dt, wanted, later, felt)
+        if self.looks is None:
+            own, other = seen.force[self._arm], seen.force[1 - self._arm]
+            # A job that stops may do so because a sensor is wrong: what was integrated stays.
+            felt = None
+            if self.machine.state == "running":
+                felt = own if own is not None else other
+            self.press.tick(dt, wanted, later, felt)
+        elif self.machine.state == "running":
+            raw = self._force[self._arm]
+            if raw is not None:
+                self.press.creep(dt, wanted, abs(raw - self.looks.offset(self._arm)))
+            self.looks.note(now, self.machine, seen, list(self._force), self.press.way)
         if self.machine.state == "held" and self.command in ("continue", "back"):
             direction = 1.0 if self.command == "continue" else -1.0
             self.command = self.fault = ""
@@ -212,23 +250,43 @@ class Stream:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Stream the job; returns the exit code: 0 when it is done."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--check", action="store_true", help="look at both arms and move nothing")
+    add_options(parser)
     options = parser.parse_args(arguments)
     try:
         job = Job.read(BUNDLE / "job.json")
         config = json.loads((BUNDLE / "config/egm.json").read_text("utf-8"))
-        stream = Stream(job, config)
         sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in config["ports"]]
         for each, port in zip(sockets, config["ports"], strict=True):
             each.bind(("", port))
-        return streamed(stream, sockets, options.check)
+
+        def drive(part: Job, word: str) -> bool:
+            stream = Stream(part, config, looks)
+            print(BLOCK if word else AIR, file=sys.stderr)
+            if streamed(stream, sockets, word=word):
+                return False
+            stream.machine.hold("it goes back")
+            stream.command = "back"
+            return streamed(stream, sockets) == BACK
+
+        looks = Looks()
+        if options.check or options.in_air:
+            return streamed(Stream(unloaded(job), config, looks), sockets, options.check)
+        if options.bring_up:
+            return bring_up(BUNDLE, job, config["plan"], drive, looks)
+        return streamed(Stream(job, config, require(BUNDLE, job, config["plan"])), sockets)
     except (OSError, Refused) as error:
         print(error, file=sys.stderr)
         return 2
 
 
-def streamed(stream: Stream, sockets: Sequence[socket.socket], check: bool) -> int:
+def streamed(
+    stream: Stream, sockets: Sequence[socket.socket], check: bool = False, word: str = ""
+) -> int:
     """Answer both controllers until the job is done; returns the exit code.
+
+    Args:
+        check: look at both arms and move nothing.
+        word: to be typed before the job begins.
 
     Raises:
         Refused: a controller does not begin, or an arm is not at its first place.
@@ -260,17 +318,21 @@ def streamed(stream: Stream, sockets: Sequence[socket.socket], check: bool) -> i
             stream.command = line.strip()
             if not line:
                 waiting.remove(sys.stdin)
-        if stream.machine.state == "ready" and all(q is not None for q in stream.seen(now).q):
+        if (
+            stream.machine.state == "ready"
+            and all(q is not None for q in stream.seen(now).q)
+            and stream.command == word
+        ):
             stream.machine.start(stream.seen(now))
             if check:
                 print("both arms are at their first places", file=sys.stderr)
                 return 0
-        if stream.machine.state == "ready" and now - begin > PATIENCE:
+        if stream.machine.state == "ready" and not word and now - begin > PATIENCE:
             raise Refused("a controller is silent: is CarryEgm running in both tasks?")
         if stream.machine.state == "held" and stream.command == "leave":
             print(f"left while {stream.told()}", file=sys.stderr)
             return 1
-    return 0 if stream.machine.clock.s > 0.0 else 3
+    return 0 if stream.machine.clock.s > 0.0 else BACK
 
 
 CORRECTION = 3

@@ -1,4 +1,4 @@
-"""Runs the job: python3 run_job.py [--check], beside the launched controllers.
+"""Runs the job: python3 run_job.py [--check|--in-air|--bring-up], beside the launched controllers.
 
 Both arms get the whole job at once. While they drive it, this program looks at them a hundred times
 a second. Ctrl-C, an arm that is silent, late or off its path, a force out of its band: both arms
@@ -35,6 +35,17 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
+from hybrid_opt.extras.bundles.programs.bring_up import (
+    AIR,
+    BACK,
+    BLOCK,
+    Looks,
+    Measured,
+    add_options,
+    bring_up,
+    require,
+    unloaded,
+)
 from hybrid_opt.extras.bundles.programs.carry_job import Job, Refused
 from hybrid_opt.extras.bundles.programs.carry_machine import Machine, Moment, Seen
 
@@ -88,13 +99,19 @@ def fill(message: Any, values: dict[str, Any]) -> None:
 class Run:
     """A run of the job by both arms' controllers, as config/cell.json describes them."""
 
-    def __init__(self, node: Any, job: Job, config: dict[str, Any]) -> None:
-        """Subscribe to both arms, with nothing sent."""
-        self.node, self.job, self.config = node, job, config
-        sensors = [source is not None for source in config["wrench"]]
+    def __init__(
+        self, node: Any, job: Job, config: dict[str, Any], known: Sequence[Measured] | Looks
+    ) -> None:
+        """Subscribe to both arms, with nothing sent.
+
+        Args:
+            known: what was measured of the arms, or looks that measure them.
+        """
+        self.node, self.config = node, config
+        self.looks = known if isinstance(known, Looks) else None
+        self._signs = None if isinstance(known, Looks) else [each.sign for each in known]
         self._grips: list[dict[str, Any] | None] = config.get("grip", [None, None])
-        inputs = [bool(grip and grip["input"]) for grip in self._grips]
-        self.machine = Machine(job, config["lag"], LEAD_OF_STOP, sensors, inputs)
+        self.take(job)
         self.fault, self.command, self.lost = "", "", False
         self._began, self._last = 0.0, 0.0
         self._q: list[dict[str, float]] = [{}, {}]
@@ -120,6 +137,13 @@ class Run:
             ActionClient(node, FollowJointTrajectory, group["action"]) for group in config["groups"]
         ]
 
+    def take(self, job: Job) -> None:
+        """Take a job, to be begun."""
+        sensors = [source is not None and self.looks is None for source in self.config["wrench"]]
+        inputs = [bool(grip and grip["input"]) for grip in self._grips]
+        self.job = job
+        self.machine = Machine(job, self.config["lag"], LEAD_OF_STOP, sensors, inputs)
+
     def _joints(self, message: Any) -> None:
         for arm, robot in enumerate(self.job.robots):
             known = dict(zip(message.name, message.position, strict=False))
@@ -138,7 +162,7 @@ class Run:
         def heard(message: Any) -> None:
             force = message.wrench.force
             along = axis[0] * force.x + axis[1] * force.y + axis[2] * force.z
-            self._force[arm], self._felt[arm] = abs(along), self._stamp(message)
+            self._force[arm], self._felt[arm] = along, self._stamp(message)
 
         self.node.create_subscription(WrenchStamped, source["topic"], heard, NEWEST)
 
@@ -185,19 +209,26 @@ class Run:
                 self.fault = self.fault or f"{name} was refused: {reason or 'without a reason'}"
         self._calls = [call for call in self._calls if not call[1].done()]
         now, silence = self.now(), self.job.limits.silence
-        felt = zip(self._force, self._felt, strict=True)
         holds = zip(self._holds, self._told, strict=True)
         return Seen(
             q=[
                 [known[name] for name in robot["ros_joints"]] if known else None
                 for known, robot in zip(self._q, self.job.robots, strict=True)
             ],
-            force=[force if now - then <= silence else None for force, then in felt],
+            force=[self._normal_force(arm, now) for arm in (0, 1)],
             age=[max(0.0, now - then) for then in self._measured],
             grip=[on if now - then <= silence else None for on, then in holds],
             fault=self.fault,
             lost=self.lost,
         )
+
+    def _normal_force(self, arm: int, now: float) -> float | None:
+        """Return a pad's measured normal force [N]; while it is measured, none."""
+        raw = self._raw(arm, now)
+        return None if raw is None or self._signs is None else self._signs[arm] * raw
+
+    def _raw(self, arm: int, now: float) -> float | None:
+        return self._force[arm] if now - self._felt[arm] <= self.job.limits.silence else None
 
     def spin(self, until: float) -> None:
         """Handle messages until a time [s]."""
@@ -365,9 +396,11 @@ class Run:
     def tick(self) -> None:
         """Check the arms and react."""
         machine = self.machine
-        before, now = machine.state, self.now()
-        machine.tick(now - self._last, self.seen())
+        before, now, seen = machine.state, self.now(), self.seen()
+        machine.tick(now - self._last, seen)
         self._last = now
+        if self.looks is not None:
+            self.looks.note(now, machine, seen, [self._raw(arm, now) for arm in (0, 1)])
         if machine.opened:
             self._go_on(machine.clock.rate)
         self._switch()
@@ -399,6 +432,20 @@ class Run:
             self.send(moments, self._began)
         except Refused as error:
             self.node.get_logger().error(f"{error}; the job goes on to its end as planned")
+
+    def drive(self, part: Job, word: str) -> bool:
+        """Drive a part of the job to its end and back, once somebody has said a word."""
+        self.take(part)
+        self.node.get_logger().info(BLOCK if word else AIR)
+        while self.command != word and not self.fault:
+            self.spin(self.now() + PERIOD)
+        self.check()
+        self.start()
+        if self.look_after():
+            return False
+        self.machine.hold("it goes back")
+        self._resume(-1.0)
+        return self.look_after() == BACK
 
     def _resume(self, direction: float) -> None:
         self.command, self.fault, self.lost = "", "", False
@@ -436,20 +483,23 @@ class Run:
         except BaseException:
             self.stop("run_job.py has failed")
             raise
-        return 0 if machine.clock.s > 0.0 else 3
+        return 0 if machine.clock.s > 0.0 else BACK
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the job; returns the exit code: 0 when it is done."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--check", action="store_true", help="look at both arms and move nothing")
+    add_options(parser)
     options = parser.parse_args(arguments)
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     config = json.loads((BUNDLE / "config/cell.json").read_text("utf-8"))
     clock = Parameter("use_sim_time", value=config["simulated"])
     node = rclpy.create_node("run_job", parameter_overrides=[clock])
     try:
-        run = Run(node, Job.read(BUNDLE / "job.json"), config)
+        job, plan = Job.read(BUNDLE / "job.json"), config["plan"]
+        is_free = options.check or options.in_air or options.bring_up
+        looks = Looks()
+        run = Run(node, job, config, looks if is_free else require(BUNDLE, job, plan))
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, run.interrupt)
         if options.check:
@@ -457,6 +507,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
             node.get_logger().info("both arms are at their first places")
             return 0
         run.prepare()
+        if options.bring_up:
+            return bring_up(BUNDLE, job, plan, run.drive, looks)
+        if options.in_air:
+            run.take(unloaded(job))
         run.check()
         run.start()
         return run.look_after()

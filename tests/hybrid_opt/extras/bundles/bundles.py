@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
+import math
 from dataclasses import replace
 from functools import cache
 from unittest.mock import patch
@@ -11,6 +13,7 @@ from hybrid_opt.extras.bundles import TARGETS, BundleOptions
 from hybrid_opt.extras.bundles.bundle import prepared
 from hybrid_opt.extras.bundles.job_file import Contents, Export
 from hybrid_opt.extras.bundles.programs import carry_job as programs
+from hybrid_opt.extras.bundles.programs.bring_up import FILE, Measured
 from hybrid_opt.job.records import Job
 from symbolic.records import Driver
 from tests.hybrid_opt.job.jobs import rack_job
@@ -49,6 +52,24 @@ def contents(target: str, driver: str = "simulation") -> Contents:
     """The files of a bundle by path."""
     with patch("hybrid_opt.extras.bundles.torque.driver_of", return_value=driver):
         return TARGETS[target].files(exported(target, driver))
+
+
+def as_planned(files: Contents, sign: float = 1.0) -> Contents:
+    """A bundle of arms that its bring-up found to be as they were planned.
+
+    Args:
+        sign: of the force that sensors read where pads press.
+    """
+    text = files["job.json"]
+    assert isinstance(text, str)
+    config = json.loads(files.get("config/egm.json") or files["config/cell.json"])
+    lines = [f'job = "{hashlib.sha256(text.encode()).hexdigest()}"']
+    for driver in config["plan"]["drivers"]:
+        stiffness = config["plan"]["stiffness"] or math.nan
+        found = Measured(driver["lag"], 0.0, 1.0, 0.0, sign, stiffness, 1.0)
+        lines += ["[[robots]]", "[robots.measured]"]
+        lines += [f"{name} = {value}" for name, value in vars(found).items()]
+    return {**files, FILE: "\n".join(lines)}
 
 
 @cache

@@ -4,13 +4,14 @@ The controllers are C++; these are their rules, after ros2_controllers jazzy
 (joint_trajectory_controller.cpp: goals of an inactive controller are rejected, :1401; what is
 validated, :1740; a hold has no effort, :2083; trajectory.cpp: quintic positions and linear efforts
 between points, :296). libfranka sets a load only while no motion runs. Arms follow their commands
-at once; their sensors feel what the job's nearest sample presses.
+`lag` later; their sensors feel what the job's nearest sample presses.
 
 NumPy only: environments of ROS 2 import it, too.
 """
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -168,6 +169,8 @@ class ControlledCell:
         silent: arms that publish no joint states.
         offset: by which an arm's encoders are wrong [rad].
         felt: offset of each sensor [N]; None for one that is silent.
+        sign: of what the sensors read when the pads press.
+        lag: of each arm [s].
         switched: when the hands of an arm were switched, and whether on: (time, arm, on).
         leaks: arms whose hands do not hold.
     """
@@ -178,6 +181,7 @@ class ControlledCell:
         self.record: list[tuple[Any, ...]] = []
         self.silent, self.offset = [False, False], [0.0, 0.0]
         self.felt: list[float | None] = [0.0, 0.0]
+        self.sign, self.lag = 1.0, [0.0, 0.0]
         self.grips: list[dict[str, Any]] = config.get("grip", [])
         self.switched: list[tuple[float, int, bool]] = []
         self.leaks = [False, False]
@@ -192,6 +196,7 @@ class ControlledCell:
             self.controllers[group["action"]] = made
             for arm, robot in robots.items():
                 self._arms[arm] = made, [made.joints.index(name) for name in robot["ros_joints"]]
+        self._told: list[deque[tuple[float, Array]]] = [deque(), deque()]
         self._samples = [
             (np.array(robot["position"]), np.array(robot["hold_effort_without_gravity"]))
             for robot in self.robots
@@ -223,9 +228,15 @@ class ControlledCell:
 
     def move(self) -> None:
         """Let all arms follow: they are where their controllers want them."""
-        for controller in self.controllers.values():
+        for arm, lag in enumerate(self.lag):
+            controller, part = self.of(arm)
+            told = self._told[arm]
+            told.append((self.time(), controller.desired[part]))
+            while len(told) > 1 and told[1][0] <= self.time() - lag + 1e-9:
+                told.popleft()
             if controller.is_active:
-                controller.q = np.where(controller.stands, controller.q, controller.desired)
+                q = np.where(controller.stands[part], controller.q[part], told[0][1])
+                controller.q[part] = q
 
     def pressed(self, arm: int) -> float:
         """Normal force [N] of the job's sample whose posture and effort are the nearest."""

@@ -21,6 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from hybrid_opt.extras.bundles.job_file import SHARED, Contents
 from hybrid_opt.store.bundle_file import write_bundle
+from tests.hybrid_opt.extras.bundles.bundles import as_planned
 from tests.hybrid_opt.extras.bundles.controlled import SUCCEEDED, ControlledCell
 
 STEP = 0.005
@@ -119,9 +120,6 @@ class World(ControlledCell):
         self.now, self.log = 100.0, list[str]()
         self.at: list[tuple[float, int, Callable[[], None]]] = []
         self.subscriptions: dict[str, list[Callable[[Any], None]]] = {}
-        self.silent, self.offset = [False, False], [0.0, 0.0]
-        self.felt: list[float | None] = [0.0, 0.0]
-        """Offset of each sensor [N]; None for one that is silent."""
         self.lateness = 0.0
         """Time between a measurement and its arrival [s]."""
         self.signals: dict[int, Callable[..., None]] = {}
@@ -160,7 +158,7 @@ class World(ControlledCell):
                 told.append((topics[arm if len(topics) > 1 else 0], message))
             offset = self.felt[arm]
             if source is not None and offset is not None:
-                newton = self.pressed(arm) + offset
+                newton = self.sign * (self.pressed(arm) + offset)
                 xyz = zip("xyz", (newton * value for value in source["axis"]), strict=True)
                 wrench = Message(force=Message(xyz))
                 told.append((source["topic"], Message(header=header, wrench=wrench)))
@@ -298,7 +296,7 @@ def run(
         prepare: what is to happen in the world.
         make: the world from the bundle's files and configuration.
     """
-    write_bundle(folder, files, {})
+    write_bundle(folder, files if "--bring-up" in arguments else as_planned(files), {})
     world = make(files, json.loads(files["config/cell.json"]))
     signals = SimpleNamespace(
         SIGINT=signal.SIGINT, SIGTERM=signal.SIGTERM, signal=world.signals.__setitem__

@@ -24,9 +24,11 @@ from hybrid_opt.extras.bundles.arms import ABB, UR, require_arms
 from hybrid_opt.extras.bundles.bundle import prepared
 from hybrid_opt.extras.bundles.egm import egm_files
 from hybrid_opt.extras.bundles.job_file import Contents
-from hybrid_opt.extras.bundles.programs.carry_job import Job
+from hybrid_opt.extras.bundles.programs.bring_up import FILE, Looks, Measured, bring_up, require
+from hybrid_opt.extras.bundles.programs.carry_job import Job, Refused
 from hybrid_opt.extras.bundles.programs.run_egm import FromRobot, Stream, read_robot, to_robot
 from hybrid_opt.job.records import HELD_PHASES, PHASES
+from studies.programs.trajectory import driver_changes
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.robot.model import build_robot_model
@@ -168,10 +170,17 @@ def files_for(stiffness: float) -> Contents:
     return egm_files(prepared(rack_driven(), "abb-egm", options))
 
 
+MEASURED = [Measured(0.03, 0.0, 1.0, 0.0, -1.0, STIFFNESS)] * 2
+"""Of arms that are what they were planned to be."""
+
+
 class Cell:
     """Two controllers that follow late, and a box between two springs.
 
     Attributes:
+        part: of the job that is driven.
+        is_empty: nothing stands between the pads.
+        sign: of the force that the sensors read.
         force: of the pads on the box [N].
         record: per cycle time, coordinate of the stream, force, its reference, both arms' joints.
     """
@@ -179,29 +188,46 @@ class Cell:
     def __init__(self, planned: float = STIFFNESS, real: float = STIFFNESS) -> None:
         """Arms of a real stiffness, in a bundle for a planned one [N/m]."""
         files, self.stiffness = files_for(planned), real
-        self.job = Job(json.loads(files["job.json"]))
-        config = json.loads(files["config/egm.json"])
-        self.stream = Stream(self.job, config)
+        self.job = self.part = Job(json.loads(files["job.json"]))
+        self.config = config = json.loads(files["config/egm.json"])
+        self.stream = Stream(self.job, config, MEASURED)
+        self.is_empty, self.sign = False, -1.0
         self.now, self.force = 50.0, 0.0
         self.offset, self.silent = 0.0, [False, False]
         self.stands = [False, False]
         self.record: list[tuple[float, float, float, float, Array]] = []
-        late = round(config["lags"][0] / CYCLE)
-        first = [self.job.position(arm, 0.0) for arm in (0, 1)]
-        self._told = [deque([q] * (late + 1), maxlen=late + 1) for q in first]
-        self._q = [list(q) for q in first]
+        self._q = [self.job.position(arm, 0.0) for arm in (0, 1)]
+        self.follow(config["lags"])
+
+    def follow(self, lags: Any) -> None:
+        """Let both arms follow with lags [s]."""
+        late = [round(lag / CYCLE) for lag in lags]
+        both = zip(self._q, late, strict=True)
+        self._told = [deque([q] * cycles, maxlen=cycles) for q, cycles in both]
+
+    def drive(self, part: Job, word: str) -> bool:
+        """Drive a part of the job to its end and back, as the program does."""
+        looks = self.stream.looks or Looks()
+        self.part, self.is_empty = part, not word
+        self.stream = Stream(part, self.config, looks)
+        assert self.run("done", "held") == "done", self.stream.machine.told()
+        self.stream.machine.hold("it goes back")
+        self.stream.command = "back"
+        self.cycle()
+        return self.run("done", "held") == "done"
 
     def cycle(self) -> None:
         """One cycle of both controllers."""
         self.now += CYCLE
         stream = self.stream
+        stream.tick(self.now)
         for arm in (0, 1):
             if not self.stands[arm]:
                 self._q[arm] = list(self._told[arm][0])
         q = np.concatenate(self._q)
         along = gap(q)
         s = stream.machine.clock.s
-        touches = self.job.begin("press") < s < self.job.begin("retreat")
+        touches = self.part.begin("press") < s < self.part.begin("retreat") and not self.is_empty
         self.force = max(0.0, -self.stiffness / 2.0 * along) if touches else 0.0
         for arm in (0, 1):
             if self.silent[arm]:
@@ -209,16 +235,15 @@ class Cell:
             degrees = [math.degrees(value) for value in self._q[arm]]
             # Of the pressing arm's sensor: what it feels is made right, and the other's is wrong.
             offset = self.offset if arm == stream._arm else 0.0
-            felt = [0.0, 0.0, -(self.force + offset), 0.0, 0.0, 0.0]
+            felt = [0.0, 0.0, self.sign * (self.force + offset), 0.0, 0.0, 0.0]
             message = read_robot(from_robot(1, degrees, felt, True))
             stream.hear(arm, message, self.now)
             # EgmSensor's planned has the number of EgmRobot's feedBack.
             answer = read_robot(stream.answer(arm, 1, self.now)).joints
             self._told[arm].append([math.radians(value) for value in answer])
-        stream.tick(self.now)
         if stream.machine.state == "ready":
             stream.machine.start(stream.seen(self.now))
-        wanted = self.job.force(stream._arm, s)
+        wanted = self.part.force(stream._arm, s)
         self.record.append((self.now, s, self.force, wanted, q))
 
     def run(self, *states: str, middle: float = np.inf) -> str:
@@ -305,6 +330,56 @@ def test_arms_stiffer_than_measured_do_not_press_beyond_bounds(real: float) -> N
         cell.cycle()
     force = np.array([row[2] for row in cell.record])
     assert force.max() < 1.5 * max(cell.job.robots[cell.stream._arm]["normal_force"])
+
+
+LAGS = (0.028, 0.032)
+"""With which the arms follow that are measured [s]; both are planned with 0.03."""
+
+
+def measured(cell: Cell, folder: Path) -> tuple[list[Measured], str]:
+    """What the bring-up of a cell finds, and what the program says against the job then."""
+    (folder / "job.json").write_text(str(files_for(STIFFNESS)["job.json"]), "utf-8")
+    looks, plan, refusal = Looks(), cell.config["plan"], ""
+    cell.stream = Stream(cell.job, cell.config, looks)
+    try:
+        bring_up(folder, cell.job, plan, cell.drive, looks)
+        assert require(folder, cell.job, plan)[0].stiffness > 0.0
+    except Refused as error:
+        refusal = str(error)
+    return [looks.measured(cell.job, arm, plan["leads"][arm]) for arm in (0, 1)], refusal
+
+
+@pytest.mark.parametrize(
+    ("stiffness", "sign"),
+    [
+        (1e4, -1.0),
+        (1e5, 1.0),
+        pytest.param(3e4, 1.0, marks=pytest.mark.slow),
+        pytest.param(3e5, -1.0, marks=pytest.mark.slow),
+    ],
+)
+def test_bring_up_measures_what_the_arms_are(stiffness: float, sign: float, tmp_path: Path) -> None:
+    """Arms of a known stiffness, lag, offset and sign; all were planned with 10 kN/m."""
+    cell = Cell(STIFFNESS, stiffness)
+    cell.sign, cell.offset = sign, 1.0
+    cell.follow(LAGS)
+    found, refusal = measured(cell, tmp_path)
+    pressing_arm = found[cell.stream._arm]
+    assert pressing_arm.stiffness == pytest.approx(stiffness, rel=0.05)
+    assert pressing_arm.sign == sign
+    assert pressing_arm.offset == pytest.approx(sign, abs=1e-6)
+    for own, lag in zip(found, LAGS, strict=True):
+        assert own.lag == pytest.approx(lag, abs=CYCLE)
+        assert own.speed == pytest.approx(1.0, abs=0.03)
+    assert max(row[2] for row in cell.record) < 1.5 * cell.job.force(0, cell.job.begin("lift"))
+    assert ("N/m at its pad, planned are 10000" in refusal) == (stiffness != STIFFNESS)
+    # An export with this file plans with what was measured.
+    changes = driver_changes(tmp_path / FILE, rack_driven().workcell)
+    for arm, own in enumerate(found):
+        driver = changes[f"robots[{arm}].driver"]
+        assert driver["stiffness"] == pytest.approx(pressing_arm.stiffness, rel=0.01)
+        assert driver["lag"] == pytest.approx(own.lag, abs=1e-4)
+        assert driver["address"] == "192.168.0.10"
 
 
 def test_packets_of_others_and_broken_ones_are_dropped_and_counted() -> None:

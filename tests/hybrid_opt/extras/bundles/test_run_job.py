@@ -5,15 +5,18 @@ from __future__ import annotations
 
 import json
 import re
+import tomllib
 from collections.abc import Callable
 from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 from unittest.mock import patch
 
 import numpy as np
 import pytest
 
+from hybrid_opt.extras.bundles.programs.bring_up import BLOCK, FILE
 from symbolic.array import Array
 from tests.hybrid_opt.extras.bundles import mock_ros
 from tests.hybrid_opt.extras.bundles.bundles import contents
@@ -332,3 +335,74 @@ def test_a_payload_is_sent_as_the_driver_defines_it(tmp_path: Path) -> None:
         code, world = run(contents("torque", "ur"), tmp_path)
     assert code == 0, world.log
     assert set(world.calls[0][1]) == {"payload"}
+
+
+def bring_up(driver: str, folder: Path, prepare: Fault) -> tuple[int, World, dict[str, Any]]:
+    """Run a bundle's bring-up, with a block once it asks for one; what it wrote last."""
+
+    def with_block(world: World) -> None:
+        def press() -> None:
+            if BLOCK in world.log[-1:]:
+                world.command("press")
+
+        prepare(world)
+        for k in range(200):
+            world.later(0.5 * k, press)
+
+    code, world = run(contents("torque", driver), folder, with_block, ["--bring-up"])
+    path = folder / FILE
+    return code, world, tomllib.loads(path.read_text("utf-8")) if path.exists() else {}
+
+
+def test_bring_up_measures_what_the_arms_are(tmp_path: Path) -> None:
+    """Arms of a known lag, sensors of a known offset and sign; the job then runs."""
+
+    lags, offsets = [0.025, 0.035], [1.0, 0.5]
+
+    def prepare(world: World) -> None:
+        world.lag, world.sign, world.felt = lags, -1.0, list(offsets)
+
+    code, world, found = bring_up("franka", tmp_path, prepare)
+    assert code == 0, world.log
+    for own, lag, offset in zip(found["robots"], lags, offsets, strict=True):
+        own = own["measured"]
+        assert own["lag"] == pytest.approx(lag, abs=0.002)
+        assert own["speed"] == pytest.approx(1.0, abs=0.03)
+        assert own["offset"] == pytest.approx(-offset, abs=0.01)
+        assert (own["sign"], own["press"]) == (-1.0, pytest.approx(1.0, abs=0.05))
+    np.testing.assert_allclose(column(world, 1)[-1], both(0.0), atol=1e-4)
+
+
+LATE: dict[str, tuple[str, Fault]] = {
+    "right lags by 6. ms, planned are 30": ("ur", lambda w: setattr(w, "lag", [0.06, 0.065])),
+    "the arms are .* ms apart": ("simulation", lambda w: setattr(w, "lag", [0.0, 0.06])),
+    "the sensor of left feels": ("ur", off_by_ten),
+}
+
+
+@pytest.mark.parametrize("told", LATE)
+def test_a_job_refuses_arms_that_are_not_as_planned(told: str, tmp_path: Path) -> None:
+    driver, prepare = LATE[told]
+    code, world, found = bring_up(driver, tmp_path, prepare)
+    assert code == 2
+    assert re.search(told, world.log[-1]), world.log
+    assert f"--driver {tmp_path / FILE}" in world.log[-1]
+    assert {robot["name"] for robot in found["robots"]} == {"left", "right"}
+
+
+def test_a_job_refuses_arms_that_nobody_measured(tmp_path: Path) -> None:
+    """Or that were measured with another job."""
+    for text, told in (("", "nothing was measured"), ('job = ""\nrobots = []', "of another job")):
+        with patch.object(mock_ros, "as_planned", lambda files, text=text: {**files, FILE: text}):
+            code, world = run(contents("torque"), tmp_path / told[:3])
+        assert code == 2
+        assert told in world.log[-1]
+        assert "--bring-up" in world.log[-1]
+
+
+def test_in_the_air_the_whole_job_is_driven_without_force(tmp_path: Path) -> None:
+    code, world = run(contents("torque", "franka"), tmp_path, arguments=["--in-air"])
+    assert code == 0, world.log
+    np.testing.assert_allclose(column(world, 1)[-1], both(job().end), atol=1e-6)
+    pressed = max(np.abs(job().effort(0, "without_gravity", job().pressed, 0.0)))
+    assert np.abs(column(world, 2)).max() < pressed

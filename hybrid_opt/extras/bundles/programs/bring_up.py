@@ -1,0 +1,344 @@
+"""Measures what a job depends on, before its first box, and keeps it in measured.toml.
+
+In the air both arms drive the whole job and back, with no force and nothing between the pads. Then
+they press a block as wide as the box, at its start, slowly; a job of hands or without sensors needs
+none. The job refuses to run without these numbers, or where one is farther from its plan than the
+tolerances below. `export --driver measured.toml` plans with them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import tomllib
+from argparse import ArgumentParser
+from bisect import bisect_left
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field
+from math import isnan, nan
+from pathlib import Path
+from statistics import linear_regression, median
+from typing import Any
+
+from hybrid_opt.extras.bundles.programs.carry_job import Job, Refused
+from hybrid_opt.extras.bundles.programs.carry_machine import UNLOADED, Machine, Seen
+
+FILE = "measured.toml"
+
+BACK = 3
+"""Exit code of a job that went back to its beginning."""
+
+LAG, STIFFNESS, SPEED = 0.01, 0.25, 0.95
+"""Allowed error of the lag [s] and of the stiffness, over the planned one; least speed over the
+planned one."""
+
+EVERY, WINDOW = 0.02, 3
+"""Between two looks at moving arms [s]; a speed is of so many of these."""
+
+AHEAD, BEHIND = 0.05, 0.3
+"""A posture is looked for so far around its command [s]."""
+
+IN_AIR = {"behind": 0.15, "skew": 0.1}
+"""How late arms may be where nothing is between them [s]."""
+
+FAST = 0.5
+"""Share of its largest speed above which a posture says how late an arm is."""
+
+SLOWER = 5.0
+"""A block is pressed so much slower than the box."""
+
+LEAST_FORCE, LEAST_SHARE = 5.0, 0.05
+"""Less than this force [N], or share of the largest commanded one, is no contact."""
+
+FITTED, FULL = 0.3, 0.95
+"""Shares of the largest measured force above which the stiffness is fitted, and of the largest
+commanded one above which both are compared."""
+
+AIR = "in the air: nothing stands between the pads"
+
+BLOCK = "put a block as wide as the box where the box stands at the start; then say 'press'"
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The numbers of an arm; nan where the job does not depend on one.
+
+    Attributes:
+        lag: delay behind the commands [s].
+        late: part of it that nothing compensates: both arms have to agree [s].
+        speed: largest speed of the pad over the planned one.
+        offset: of the force sensor in the air [N].
+        sign: of what it reads when the pad presses.
+        stiffness: of each arm at its pad, both in series [N/m].
+        press: measured over commanded force.
+    """
+
+    lag: float
+    late: float
+    speed: float
+    offset: float = nan
+    sign: float = nan
+    stiffness: float = nan
+    press: float = nan
+
+
+def unloaded(job: Job) -> Job:
+    """Return a job that touches nothing: without forces, and with hands that stay off; arms may be
+    later than with a box."""
+    robots = []
+    for robot in job.robots:
+        contact = robot["hold_effort_without_gravity"]
+        efforts = {
+            name: [
+                [a - b for a, b in zip(row, own, strict=True)]
+                for row, own in zip(rows, contact, strict=True)
+            ]
+            for name, rows in robot.items()
+            if "effort" in name
+        }
+        robots.append(robot | efforts | {"normal_force": [0.0] * len(job.time)})
+    phases = [{k: v for k, v in each.items() if k != "grip"} for each in job.document["phases"]]
+    machine = {"limits": job.document["machine"]["limits"] | IN_AIR}
+    return Job(job.document | {"robots": robots, "phases": phases, "machine": machine})
+
+
+def pressing(job: Job) -> Job:
+    """Return the part of a job up to the end of its press, slowed down."""
+    count = 1 + next(i for i, each in enumerate(job.document["phases"]) if each["name"] == "press")
+    phases = job.document["phases"][:count]
+    end = phases[-1]["last"] + 1
+    robots = []
+    for robot in job.robots:
+        rows = {k: v[:end] if len(v) == len(job.time) else v for k, v in _lists(robot)}
+        rows["velocity"] = [[v / SLOWER for v in row] for row in rows["velocity"]]
+        rows["acceleration"] = [[a / SLOWER**2 for a in row] for row in rows["acceleration"]]
+        for name in ("effort_with_gravity", "effort_without_gravity"):
+            both = zip(rows[name], rows[f"hold_{name}"], strict=True)
+            rows[name] = [
+                [b + (a - b) / SLOWER**2 for a, b in zip(*pair, strict=True)] for pair in both
+            ]
+        robots.append(robot | rows)
+    time = [SLOWER * t for t in job.time[:end]]
+    return Job(job.document | {"time": time, "phases": phases, "robots": robots})
+
+
+def _lists(robot: dict[str, Any]) -> Iterator[tuple[str, list[Any]]]:
+    return ((name, values) for name, values in robot.items() if isinstance(values, list))
+
+
+@dataclass(frozen=True)
+class Look:
+    """A look at moving arms.
+
+    Attributes:
+        time: [s].
+        s: commanded coordinate [s].
+        direction: along the path, 1 or -1.
+        age: of each arm's posture [s].
+        q: joint positions of each arm [rad, m].
+    """
+
+    time: float
+    s: float
+    direction: float
+    age: list[float]
+    q: list[list[float]]
+
+
+@dataclass
+class Looks:
+    """Looks at both arms while they are measured.
+
+    Attributes:
+        moving: in the air.
+        forces: raw readings of each arm's sensor in the air [N].
+        pressed: time, distance of the pressing pad beyond its place [m], commanded force and raw
+            readings [N] of each look while a block is pressed.
+    """
+
+    moving: list[Look] = field(default_factory=list)
+    forces: tuple[list[float], list[float]] = field(default_factory=lambda: ([], []))
+    pressed: list[tuple[float, float, float, list[float | None]]] = field(default_factory=list)
+
+    def note(
+        self, now: float, machine: Machine, seen: Seen, raw: list[float | None], way: float = nan
+    ) -> None:
+        """Note what is seen at a time [s].
+
+        Args:
+            raw: readings of both sensors [N]; None without one.
+            way: of the pressing pad beyond its place [m].
+        """
+        clock, job = machine.clock, machine.job
+        if machine.state != "running" or clock.turning:
+            return
+        if max(job.robots[0]["normal_force"]) > 0.0:
+            wanted = min(job.force(arm, clock.s) for arm in (0, 1))
+            if clock.rate > 0.0 and wanted > 0.0:
+                self.pressed.append((now, way, wanted, raw))
+            return
+        for own, value in zip(self.forces, raw, strict=True):
+            own += [] if value is None else [value]
+        if not self.moving or now - self.moving[-1].time >= EVERY:
+            q = [list(each) for each in seen.q if each is not None]
+            self.moving.append(Look(now, clock.s, clock.rate, seen.age, q))
+
+    def offset(self, arm: int) -> float:
+        """Return the reading of an arm's sensor in the air [N]; nan without one."""
+        return median(self.forces[arm]) if self.forces[arm] else nan
+
+    def speed(self, job: Job, arm: int) -> float:
+        """Return the largest speed of a pad over the planned one."""
+        reach, found = job.robots[arm]["reach"], [0.0]
+        for one, other in zip(self.moving, self.moving[WINDOW:], strict=False):
+            passed = other.time - other.age[arm] - one.time + one.age[arm]
+            if one.direction == other.direction and passed > EVERY:
+                moved = zip(reach, one.q[arm], other.q[arm], strict=True)
+                found.append(sum(r * abs(b - a) for r, a, b in moved) / passed)
+        window = WINDOW * EVERY
+        planned = [job.distance(arm, job.position(arm, s), s + window) / window for s in job.time]
+        return max(found) / max(planned)
+
+    def late(self, job: Job, arm: int) -> float:
+        """Return how late an arm is behind the clock [s]."""
+        fastest, found = max(job.speed(arm, s) for s in job.time), []
+        for look in self.moving:
+            forward = look.direction
+            told = min(max(look.s - forward * look.age[arm], 0.0), job.end)
+            if job.speed(arm, told) > FAST * fastest:
+                low, high = sorted((-forward * BEHIND, forward * AHEAD))
+                at = job.coordinate(arm, look.q[arm], told, (low, high), 0.0)
+                found.append(forward * (told - at))
+        return median(found) if found else nan
+
+    def contact(self, arm: int, lag: float) -> dict[str, float]:
+        """Return sign, stiffness and press of an arm with a sensor, by its lag [s].
+
+        Raises:
+            Refused: nothing presses back.
+        """
+        readings = [(t, way, wanted, raw[arm]) for t, way, wanted, raw in self.pressed]
+        known = [(*rest, raw - self.offset(arm)) for *rest, raw in readings if raw is not None]
+        most = max((row[2] for row in known), default=0.0)
+        sign = 1.0 if sum(row[3] for row in known) > 0.0 else -1.0
+        largest = max((sign * row[3] for row in known), default=0.0)
+        if largest < max(LEAST_FORCE, LEAST_SHARE * most):
+            raise Refused(f"nothing presses back, {largest:.1f} N are measured: {BLOCK}")
+        if isnan(known[0][1]):
+            full = [sign * row[3] / row[2] for row in known if row[2] >= FULL * most]
+            return {"sign": sign, "press": median(full)}
+        times = [row[0] for row in known]
+        fitted = [
+            (known[min(bisect_left(times, t - lag), len(known) - 1)][1], sign * force)
+            for t, _, _, force in known
+            if sign * force > FITTED * largest
+        ]
+        # Both arms in series have half the stiffness of each.
+        slope = linear_regression(*zip(*fitted, strict=True)).slope
+        return {"sign": sign, "stiffness": 2.0 * slope}
+
+    def measured(self, job: Job, arm: int, lead: float) -> Measured:
+        """Return the numbers of an arm whose lag is compensated by a lead [s]."""
+        late = self.late(job, arm)
+        found = Measured(lead + late, late, self.speed(job, arm))
+        if not self.forces[arm] or not self.pressed:
+            return found
+        contact = self.contact(arm, found.lag)
+        return Measured(found.lag, late, found.speed, self.offset(arm), **contact)
+
+
+def add_options(parser: ArgumentParser) -> None:
+    """Add what a program does in place of the job."""
+    group = parser.add_mutually_exclusive_group()
+    for name, text in (
+        ("--check", "look at both arms and move nothing"),
+        ("--in-air", "drive the whole job without a box and without force"),
+        ("--bring-up", "measure both arms and write " + FILE),
+    ):
+        group.add_argument(name, action="store_true", help=text)
+
+
+def bring_up(
+    folder: Path, job: Job, plan: dict[str, Any], drive: Callable[[Job, str], bool], looks: Looks
+) -> int:
+    """Measure both arms and write what was found; return the exit code.
+
+    Args:
+        folder: of the bundle.
+        plan: of its configuration.
+        drive: drives a job to its end and back, once somebody has said a word, and fills `looks`.
+
+    Raises:
+        Refused: a measurement fails.
+    """
+    parts = [(unloaded(job), "")]
+    parts += [(pressing(job), "press")] if plan["presses"] else []
+    for part, word in parts:
+        if not drive(part, word):
+            fast = [f"{looks.speed(job, arm):.2f}" for arm in (0, 1)]
+            raise Refused(f"bring-up has not ended; speed over the planned one: {', '.join(fast)}")
+    found = [looks.measured(job, arm, plan["leads"][arm]) for arm in (0, 1)]
+    # Only one of two sensors may be there.
+    stiffness = max((each.stiffness for each in found if not isnan(each.stiffness)), default=nan)
+    lines = [f"# Measured by {plan['program']} --bring-up.", f'job = "{_digest(folder)}"']
+    for robot, driver, own in zip(job.robots, plan["drivers"], found, strict=True):
+        stated = driver | {"lag": round(max(own.lag, 0.0), 4)}
+        stated |= {} if isnan(stiffness) else {"stiffness": round(stiffness, 1)}
+        lines += ["", "[[robots]]", f"name = {json.dumps(robot['name'])}", "[robots.driver]"]
+        lines += [f"{name} = {json.dumps(value)}" for name, value in stated.items()]
+        lines += ["[robots.measured]", *(f"{k} = {v:.6g}" for k, v in asdict(own).items())]
+    (folder / FILE).write_text("\n".join([*lines, ""]), "utf-8")
+    print("\n".join(lines))
+    require(folder, job, plan)
+    return 0
+
+
+def require(folder: Path, job: Job, plan: dict[str, Any]) -> list[Measured]:
+    """Return what was measured of both arms.
+
+    Raises:
+        Refused: nothing was, or a number is not what the job was planned for.
+    """
+    first = f"python3 {plan['program']} --bring-up first; --in-air drives the job without a box"
+    try:
+        document = tomllib.loads((folder / FILE).read_text("utf-8"))
+        found = [Measured(**robot["measured"]) for robot in document["robots"]]
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise Refused(f"nothing was measured of these arms ({error}): {first}") from error
+    if document.get("job") != _digest(folder) or len(found) != len(job.robots):
+        raise Refused(f"{FILE} is of another job: {first}")
+    problems = list(_problems(job, plan, found))
+    if problems:
+        raise Refused(
+            f"{'; '.join(problems)}. To plan with what was measured: dual-arm-carry export "
+            f"TRAJECTORY --target {plan['target']} --driver {folder / FILE}"
+        )
+    return found
+
+
+def _problems(job: Job, plan: dict[str, Any], found: Sequence[Measured]) -> Iterator[str]:
+    apart = abs(found[0].late - found[1].late)
+    if not apart <= job.limits.skew:
+        yield (
+            f"the arms are {1e3 * apart:.1f} ms apart, the job bears {1e3 * job.limits.skew:.1f} "
+            f"(--skew {apart:.3f}, a slower timing)"
+        )
+    for robot, own, driver in zip(job.robots, found, plan["drivers"], strict=True):
+        name, planned, most = robot["name"], plan["stiffness"], max(robot["normal_force"])
+        if not abs(own.lag - driver["lag"]) <= LAG:
+            yield f"{name} lags by {1e3 * own.lag:.0f} ms, planned are {1e3 * driver['lag']:.0f}"
+        if not own.speed >= SPEED:
+            yield (
+                f"{name} reaches {100.0 * own.speed:.0f} % of the planned speed: let its "
+                "controller drive it, or time the carry with a lower velocity_max of the robot"
+            )
+        if abs(own.offset) > UNLOADED * most:
+            yield f"the sensor of {name} feels {own.offset:.1f} N in the air: zero it"
+        if planned and abs(own.stiffness - planned) > STIFFNESS * planned:
+            yield f"{name} has {own.stiffness:.0f} N/m at its pad, planned are {planned:.0f}"
+        if not planned and abs(own.press - 1.0) > job.limits.force:
+            yield f"{name} presses {100.0 * own.press:.0f} % of the command: state its tool_load"
+
+
+def _digest(folder: Path) -> str:
+    return hashlib.sha256((folder / "job.json").read_bytes()).hexdigest()
