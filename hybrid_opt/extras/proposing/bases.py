@@ -1,7 +1,7 @@
-"""Where two robots may stand: places beside the carry, compared by how well the arms follow it, and
-by how many ways they follow on which the box alone goes around what stands in between.
+"""Possible bases of two robots: places beside the carry, ranked by how well the arms follow the
+carry from them, and by the number of detours around obstacles that both arms can follow.
 
-Heights are those of the file, or the world's zero: what a robot stands on is built by people.
+Heights of bases are those of the file, or zero: the user builds the stands of the robots.
 """
 
 from __future__ import annotations
@@ -29,64 +29,68 @@ from symbolic.records import Cylinder, Workcell
 from symbolic.records.poses import box_placement, inverse, pose_matrix, transform
 
 DISTANCES = (0.35, 0.45, 0.55, 0.65, 0.75)
-"""Distances of a base from the middle of its contact's way, sideways, in stretched arms."""
+"""Lateral distances of a base from the middle of its contact's path, in lengths of the stretched
+arm."""
 
 MACHINE_DISTANCES = (0.28, 0.34, 0.40, 0.46, 0.52)
-"""Distances of the line through a machine's shoulders from the middle of the carry, likewise."""
+"""Distances of the line through a machine's shoulders from the middle of the carry, in lengths of
+the stretched arm."""
 
 BASE_SHIFTS = (0.0, -0.2, 0.2)
-"""Shifts of a base along the carry, likewise."""
+"""Shifts of a base along the carry, in lengths of the stretched arm."""
 
 BEHIND = 0.05
-"""A machine's arms reach ahead if they do so by this much in the mean of their postures, in the
-stretched arm's length."""
+"""A machine's arms count as reaching ahead if their mean reach over random postures exceeds this
+share of the stretched arm."""
 
 REACH_MEAN_POSTURES = 500
-"""Postures in that mean."""
+"""Number of random postures in this mean."""
 
 MOST_CHOICES = 6
-"""Pairs of bases that are handed on."""
+"""Largest number of pairs of bases that are returned."""
 
 PLACE_STARTS = 192
-"""Random postures by which a place is judged."""
+"""Number of random postures from which a base is evaluated."""
 
 EVERY_SPIN = 2
-"""Stride among the pads' spins by which it is judged."""
+"""Every so many spins of the pads are tried when a base is evaluated."""
 
 GUIDES_TRIED = 2
-"""Guides by which it is judged."""
+"""Number of guides that are tried when a base is evaluated."""
 
 FOOT = Cylinder(0.12, 0.20)
-"""Foot that stands on the ground at a base and may touch nothing else [m]."""
+"""Foot on the ground at a base, which may not touch anything else [m]."""
 
 ROOMY = 4.0
-"""Score if both arms follow the box along all of them."""
+"""Score of a pair of bases if both arms follow the box along all detours."""
 
 ABOVE = 0.02
-"""How far above its floor a robot is looked at [m]."""
+"""Height above its floor at which a robot is checked for collisions [m]."""
 
 HIDDEN = 2.0
-"""Cost if something stands between a shoulder and its contact."""
+"""Cost if a body of the environment is between a shoulder and its contact."""
 
 ARM_RADIUS = 0.05
-"""Radius of the arm that must fit between them [m]."""
+"""Radius of the arm that has to fit between shoulder and contact [m]."""
 
 LIFT_HEIGHT = 0.03
-"""How far the box is lifted off what it stands on, and lowered in the end [m]."""
+"""Height by which the box is lifted from its support, and lowered in the end, on a detour [m]."""
 
 ASIDE = (0.15, 0.25, 0.40)
-"""How far it goes aside, level in eight directions or up [m]."""
+"""Distances of a detour from the straight line, level in eight directions or upwards [m]."""
 
 POSES = 33
-"""Poses along a detour."""
+"""Number of poses along a detour."""
 
 
 def base_choices(problem: Problem, spins: Array, rng: np.random.Generator) -> list[dict[str, Any]]:
-    """Return additions to a problem's tables that give both robots a base, best first; both the
-    same if they are arms of one machine.
+    """Return additions to a problem's tables that give both robots a base, best first. Arms of one
+    machine get the same base.
 
     Args:
-        spins: of both pads that are tried [rad].
+        problem: the problem.
+        spins: spins of both pads that are tried [rad].
+        rng: generator of random postures.
     """
     found: list[tuple[float, dict[str, Any]]] = []
     for side in problem.sides():
@@ -98,7 +102,7 @@ def base_choices(problem: Problem, spins: Array, rng: np.random.Generator) -> li
 def _scored(
     problem: Problem, spins: Array, rng: np.random.Generator
 ) -> list[tuple[float, dict[str, Any]]]:
-    """Score such additions for given contacts."""
+    """Return such additions with their scores for the contacts of a problem."""
     draft = draft_of(problem)
     scorer = PlaceScorer(problem, draft, spins, rng)
     if problem.is_machine:
@@ -126,7 +130,7 @@ def _scored(
 
 
 def draft_of(problem: Problem) -> Workcell:
-    """Build the cell with its robots anywhere and its redundant joints chosen."""
+    """Build the cell of a problem with provisional bases and chosen redundant joints."""
     sides = [_sideways(problem, arm) for arm in (0, 1)]
     near = [_base(problem, k, at + 0.4 * out, out) for k, (at, out) in enumerate(sides)]
     if problem.is_machine:
@@ -144,7 +148,8 @@ def _standing(problem: Problem, bases: list[Array]) -> dict[str, Any]:
 
 
 def _sideways(problem: Problem, arm: int) -> tuple[Array, Array]:
-    """Compute the middle (3,) of the path of a robot's contact and the outward direction (3,)."""
+    """Compute the middle (3,) of the path of a robot's contact [m], and the outward direction
+    (3,)."""
     point = np.append(np.array(problem.contacts[arm]["xyz"], dtype=float), 1.0)
     ends = [(box_placement(problem.orientation, pose) @ point)[:3] for pose in problem.poses]
     middle = (ends[0] + ends[1]) / 2.0
@@ -172,8 +177,8 @@ def _places(problem: Problem, draft: Workcell, arm: int) -> list[Array]:
 
 
 def machine_places(problem: Problem, draft: Workcell) -> list[Array]:
-    """Compute bases (6,) of a machine with both arms: the line through its shoulders along the line
-    through both contacts, the carry where its arms reach."""
+    """Compute bases (6,) of a machine with both arms. The line through the shoulders is parallel to
+    the line through both contacts, and the carry is within reach of the arms."""
     own = inverse(draft.robots[0].T_world_base)
     at = [(own @ np.append(point, 1.0))[:3] for point in shoulder_positions(draft.robots)]
     middle, outwards = _sideways(problem, 0)
@@ -195,8 +200,8 @@ def machine_places(problem: Problem, draft: Workcell) -> list[Array]:
 
 
 def _mean_reach(draft: Workcell, at: list[Array]) -> Array:
-    """Compute the mean vector (3,) from a machine's shoulders to its arms' last joints over random
-    postures of both, in the base frame [m]."""
+    """Compute the mean vector (3,) [m] from a machine's shoulders to the last joints of its arms,
+    over random postures of both, in the base frame."""
     rng, reaches = np.random.default_rng(0), []
     for arm in (0, 1):
         kinematics = ArmKinematics(draft, arm)
@@ -211,9 +216,9 @@ class RankedBase:
     """A base from which an arm follows the box.
 
     Attributes:
-        base: (6,) its pose.
+        base: (6,) pose of the base [m, rad].
         value: score; larger is better.
-        follows: (k,) detours along which the arm follows.
+        follows: (k,) True for detours along which the arm follows the box.
     """
 
     base: Array
@@ -222,7 +227,7 @@ class RankedBase:
 
 
 class PlaceScorer:
-    """Compares places of robots for given contacts."""
+    """Evaluator of bases of robots for given contacts."""
 
     def __init__(
         self, problem: Problem, draft: Workcell, spins: Array, rng: np.random.Generator
@@ -230,10 +235,10 @@ class PlaceScorer:
         """Prepare both arms.
 
         Args:
-            problem: with its contacts.
-            draft: its cell, the robots somewhere, redundant joints chosen.
-            spins: of both pads that are tried [rad].
-            rng: its only randomness.
+            problem: the problem, with contacts.
+            draft: cell of the problem with provisional bases and chosen redundant joints.
+            spins: spins of both pads that are tried [rad].
+            rng: generator of random postures.
         """
         self._problem, self._draft, self._rng = problem, draft, rng
         start, goal = problem.poses
@@ -250,8 +255,8 @@ class PlaceScorer:
         self._feet = [_feet(draft, arm) for arm in (0, 1)]
 
     def place(self, arm: int, base: Array) -> RankedBase | None:
-        """Evaluate a base (6,) for an arm; None if it cannot stand there or does not follow the
-        box."""
+        """Evaluate a base (6,) of an arm. None if the robot collides at this base or its arm does
+        not follow the box."""
         if not self._stands_free(arm, base):
             return None
         T = pose_matrix(base[:3], base[3:])
@@ -264,14 +269,15 @@ class PlaceScorer:
         return RankedBase(base, value, self._followed(kinematics, holds))
 
     def _stands_free(self, arm: int, base: Array) -> bool:
-        """Return True if no environment body, except its floor, is where the robot would stand."""
+        """Return True if the robot at this base (6,) meets no body of the environment except its
+        floor."""
         T = pose_matrix(base[:3] + np.array([0.0, 0.0, ABOVE]), base[3:])
         feet = tuple(piece.moved(T) for piece in self._feet[arm])
         return all(coal_distance(feet, pieces) > 0.0 for pieces in self._environment)
 
     def _followed(self, kinematics: ArmKinematics, holds: Sequence[Hold]) -> NDArray[np.bool_]:
-        """Return (k,) True for detours along which an arm follows the box in one of these holds,
-        with fixed redundant joints."""
+        """Return (k,) True for detours along which the arm follows the box with one of these holds,
+        redundant joints fixed."""
         robot = self._draft.robots[kinematics.arm]
         k, m, _ = self._detours.shape
         if not k:
@@ -286,7 +292,7 @@ class PlaceScorer:
         return np.asarray((fine & (kept == m)).reshape(len(holds), k).any(axis=0))
 
     def _hidden(self, arm: int, shoulder: Array) -> float:
-        """Compute the share of start and goal at which the environment lies between a shoulder (3,)
+        """Compute the share of start and goal at which the environment is between a shoulder (3,)
         and the robot's contact, in the horizontal plane."""
         point = np.append(np.array(self._problem.contacts[arm]["xyz"], dtype=float), 1.0)
         hit = 0
@@ -307,8 +313,8 @@ class PlaceScorer:
 
 
 def _feet(draft: Workcell, arm: int) -> tuple[Piece, ...]:
-    """Return the still bodies of a robot, or of its machine, and a foot, in the base frame; of a
-    machine they are listed with the first arm."""
+    """Return the fixed bodies of a robot, or of its machine, and a foot, in the base frame. Those
+    of a machine are listed with the first arm."""
     robot = draft.robots[arm]
     own = inverse(robot.T_world_base)
     standing = [
@@ -327,11 +333,12 @@ def shared_room(first: RankedBase, second: RankedBase) -> float:
 
 
 def free_detours(workcell: Workcell, start: Array, goal: Array) -> Array:
-    """Return the detours (k, POSES, 6) that are free: up a little, aside, over to beside the goal,
-    back, down. k may be 0.
+    """Return the detours of the box (k, POSES, 6) that are free of collisions: lift, move aside,
+    move along, move back, lower. k may be 0.
 
     Args:
-        start, goal: (6,) box poses.
+        workcell: the cell.
+        start, goal: (6,) box poses [m, rad].
     """
     angles = np.arange(8) * np.pi / 4.0
     ways = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(8)])

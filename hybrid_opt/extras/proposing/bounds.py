@@ -11,44 +11,46 @@ from numpy.typing import NDArray
 from symbolic.array import Array
 
 LARGEST_BOUND_FACTOR = 8.0
-"""Largest factor of the half-widths."""
+"""Largest common factor of the half-widths of bounds."""
 
 LEAST_FACTOR = 0.02
-"""Least factor."""
+"""Smallest common factor of the half-widths."""
 
 CANDIDATES_PER_ROUND = 64
-"""Candidates per round of the bisection."""
+"""Number of random candidates per round of the bisection."""
 
 CONFIRMED = 250
-"""Candidates by which the share of the final bounds is measured."""
+"""Number of random candidates with which the share within the final bounds is measured."""
 
 BISECTION_ROUNDS = 7
-"""Rounds of the bisection."""
+"""Number of rounds of the bisection."""
 
 CANDIDATES_PER_BATCH = 32
-"""Candidates that are judged before the clock is looked at."""
+"""Number of candidates that are evaluated between two looks at the clock."""
 
 BOUND_FACTORS = (0.8, 1.2)
-"""Factor of the next bounds where too few, or too many, are feasible."""
+"""Factors on the bounds after a measurement with too few, and with too many, feasible
+candidates."""
 
 EMPTY_STEP = 0.5
-"""The same where none is."""
+"""Factor on the bounds after a measurement without feasible candidates."""
 
 BOUND_CENTRES = (1.0, 0.75, 0.5)
-"""How near the carry is looked for to the one that bounds were asked for, from their middle."""
+"""Positions at which a feasible carry near the given one is looked for: 1 at the given carry, 0 at
+the middle of the bounds."""
 
 CENTRING_MOVES = 3
-"""Times that bounds may move to where feasible candidates lie."""
+"""Largest number of times that bounds move to the middle of the feasible candidates."""
 
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of a decision vector.
+    """Bounds of a decision vector, with a feasible carry.
 
     Attributes:
-        carry: (n_var,) a feasible one within them, as near as possible to the given one.
+        carry: (n_var,) feasible carry within the bounds, as near as possible to the given one.
         lower, upper: (n_var,) [m, rad].
-        share: of random candidates that is feasible.
+        share: share of random candidates within the bounds that is feasible.
         candidates: number of candidates by which the share was measured.
     """
 
@@ -61,16 +63,18 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Sampling:
-    """How bounds are measured.
+    """Functions and settings for measuring bounds.
 
     Attributes:
-        feasible: (n,) verdicts on decision vectors (n, n_var).
-        certain: whether one decision vector is feasible between its samples too.
+        feasible: function from decision vectors (n, n_var) to (n,) True for feasible ones on their
+            samples.
+        certain: function that returns True if one decision vector is feasible between its samples
+            too.
         unit: (n_var,) half-widths that are scaled together [m, rad].
         limits: (2, n_var) limits of all bounds.
-        rng: the randomness.
-        low, high: share that is wanted.
-        out_of_time: whether to come to an end.
+        rng: generator of candidates.
+        low, high: range of the wanted share.
+        out_of_time: function that returns True if no time is left.
     """
 
     feasible: Callable[[Array], NDArray[np.bool_]]
@@ -85,9 +89,9 @@ class Sampling:
     def bounds_around(self, carry: Array) -> Bounds:
         """Find bounds around a feasible carry (n_var,).
 
-        Their common factor is bisected. In between they move to the middle of the feasible
-        candidates found, which makes room for wider ones. The carry itself stays, if it is within
-        them: where they move to is longer.
+        A common factor of the half-widths is bisected. In between the bounds move to the middle of
+        the feasible candidates, which allows wider bounds. The given carry is kept if it is within
+        the bounds, because carries in their middle are longer.
         """
         scale, centre = 0.5, carry
         for _ in range(CENTRING_MOVES):
@@ -120,7 +124,7 @@ class Sampling:
         return float(np.sqrt(self.low * self.high))
 
     def _bisected(self, centre: Array, scale: float) -> tuple[float, Array]:
-        """Bisect the factor at which about the wanted share is feasible; return it and feasible
+        """Bisect the factor for which about the wanted share is feasible. Return it and feasible
         candidates near it."""
         low, high, aim = LEAST_FACTOR, LARGEST_BOUND_FACTOR, self._aim
         good = np.empty((0, len(centre)))
@@ -143,8 +147,12 @@ class Sampling:
     def _judged(
         self, centre: Array, scale: float, most: int, wanted: tuple[float, float]
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """Evaluate candidates (n, n_var): at most `most`, fewer if the share of feasible ones is
-        surely outside the wanted range, or the time is up."""
+        """Evaluate at most `most` random candidates. Stop earlier if the share of feasible ones is
+        surely outside the wanted range, or if no time is left.
+
+        Returns:
+            Candidates (n, n_var), and (n,) True for feasible ones.
+        """
         x, fine = np.empty((0, len(centre))), np.empty(0, dtype=bool)
         bounds = self._box(centre, scale)
         while len(x) < most:

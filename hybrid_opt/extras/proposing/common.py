@@ -1,4 +1,4 @@
-"""Positions of the joints that move both arms of a machine, drawn once for both."""
+"""Positions of the joints that move both arms of a machine, chosen once for both arms."""
 
 from __future__ import annotations
 
@@ -18,29 +18,34 @@ from symbolic.array import Array
 from symbolic.records.poses import box_placement
 
 COMPARED_POSITIONS = 64
-"""Positions that are compared."""
+"""Number of random positions that are compared."""
 
 COMPARED_STARTS = 24
-"""Random postures of either arm by which one is compared."""
+"""Number of random postures of either arm from which a position is evaluated."""
 
 REACHING_STEPS = 25
-"""Newton steps from these."""
+"""Number of Newton steps from these postures."""
 
 MOVED = 4
-"""Positions at the start, and at the goal, among which common joints may move."""
+"""Number of positions at the start, and at the goal, between which common joints may move."""
 
 MOVE_COST = 0.05
-"""Share of reaching postures that a radian, or a metre, of their motion has to be worth."""
+"""Cost of moving common joints by a radian or a metre, as a share of reaching postures."""
 
 
 def common_positions(
     arms: Sequence[ArmKinematics], query: HoldQuery, rng: np.random.Generator
 ) -> Iterator[Array | None]:
-    """Yield positions (2, k) of the common joints at the start and at the goal: that of locked
-    joints, then those with the largest score; None once if there are no common joints.
+    """Yield positions (2, k) of the common joints at the start and at the goal: first those of
+    locked joints, then others by decreasing score. Yield None once if there are no common joints.
 
     The score of a position is the share of random postures from which both arms reach the box with
-    it, within their limits and away from singular postures.
+    it, within joint limits and away from singular postures.
+
+    Args:
+        arms: both arms.
+        query: the box poses and spins that the arms have to hold.
+        rng: generator of positions and postures.
     """
     if not arms[0].common:
         yield None
@@ -70,8 +75,8 @@ def common_positions(
 def _reaching(
     arm: ArmKinematics, pose: Array, spins: Array, positions: Array, rng: np.random.Generator
 ) -> Array:
-    """Compute the share (n,) of random postures that reach the box (6,) with each of the positions
-    (n, k) of the common joints."""
+    """Compute the share (n,) of random postures from which an arm reaches the box pose (6,) with
+    each of the positions (n, k) of the common joints."""
     T_world_box = box_placement(arm.workcell.task.orientation, pose)
     possible = possible_spins(arm.workcell.contacts[arm.arm], spins)
     targets = np.array([T_world_box @ arm.held(spin) for spin in possible])

@@ -1,4 +1,4 @@
-"""Decimal numbers for proposed files: rounded outwards, within what the reader allows."""
+"""Decimal numbers for proposed files: rounded outwards, within the limits of the reader."""
 
 from __future__ import annotations
 
@@ -10,29 +10,30 @@ from symbolic.records import POSE_SIZE, Workcell
 from symbolic.records.poses import Orientation
 
 RECIPROCAL_UNIT = 1e4
-"""Reciprocal of the unit that bounds are rounded to [1/m, 1/rad]."""
+"""Reciprocal of the unit to which bounds are rounded [1/m, 1/rad]."""
 
 COUNTED_DECIMALS = 6
-"""Decimals of a number in these units that count; the rest is floating-point error."""
+"""Decimals of a number in these units that count; further decimals are rounding."""
 
 USUAL_POSE = np.array([10.0, 10.0, 10.0, 3.14, 1.57, 3.14])
-"""Bounds of a pose that need no excess: the file's for positions, one turn for angles [m, rad]."""
+"""Limits of a pose that never need to be exceeded: the file's limits for positions, one turn for
+angles [m, rad]."""
 
 ANGLE_ROOM = 0.5
-"""Range of angles about a carry beyond `USUAL_POSE` [rad]."""
+"""Range of angles about a carry that exceeds `USUAL_POSE` [rad]."""
 
 ANGLE_LIMIT = 6.28
-"""Largest angle of a bound: the file's limit is a full turn [rad]."""
+"""Largest angle of a bound [rad]; a file allows a full turn."""
 
 VECTOR_LIMIT = MOST_TURN - 0.01
-"""Largest rotation vector of a bound, if the carry itself has none larger [rad]."""
+"""Largest rotation vector of a bound [rad], unless the carry has a larger one."""
 
 LEAST_ROOM = 1e-3
 """Range about a rotation vector at its limit, towards zero [rad]."""
 
 
 def pose_limits(pose: Array, orientation: Orientation) -> Array:
-    """Compute the limits (2, 6) of bounds around a pose (6,), which lies between them."""
+    """Compute limits (2, 6) of bounds around a pose (6,). The pose is within them."""
     high = USUAL_POSE.copy()
     low = -high
     if orientation.is_vector:  # the farthest corner of such a cube is no longer than allowed
@@ -48,7 +49,8 @@ def pose_limits(pose: Array, orientation: Orientation) -> Array:
 
 
 def joint_limits(workcell: Workcell) -> Array:
-    """Return the limits (2, m) of the redundant joints; of both arms where a joint moves both."""
+    """Return the limits (2, m) of the redundant joints. A joint that moves both arms has the limits
+    of both."""
     found = []
     for joint in workcell.task.redundant:
         driven = [
@@ -84,7 +86,7 @@ def rounded_outwards(bounds: Array, limits: Array) -> Array:
 
 
 def readable_turns(poses: Array, orientation: Orientation) -> Array:
-    """Return poses (n, 6) with every angle that a file may not hold turned back by whole turns.
+    """Return poses (n, 6) with angles that a file may not contain turned back by full turns.
 
     The reader unwraps angles along the path, so the path stays the same.
     """

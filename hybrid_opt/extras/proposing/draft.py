@@ -1,4 +1,4 @@
-"""A found path, and the changes of a problem file that describe it."""
+"""A found path, and the changes to a problem file that describe it."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from symbolic.read.editing import merged
 from symbolic.records import POSE_SIZE, Workcell
 
 UNIT = np.array([0.10, 0.10, 0.10, 0.08, 0.08, 0.08])
-"""Half-widths of a pose that are scaled together [m, rad]."""
+"""Half-widths of a pose's bounds, which share one factor [m, rad]."""
 
 REDUNDANT_UNIT = 0.15
-"""Half-width of a redundant joint's value [rad or m]."""
+"""Half-width of the bounds of a redundant joint, for the same factor [rad or m]."""
 
 CARRY_DECIMALS = 5
 """Decimals of a carry in a file [m, rad]: a hundredth of a millimetre."""
@@ -32,16 +32,16 @@ CARRY_DECIMALS = 5
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """A path as found, and the cell it was found in.
+    """A found path, with the cell in which it was found.
 
     Attributes:
-        workcell: the cell that it was found in, with its redundant joints chosen.
-        spins: of both pads, beside those of the file [rad].
-        branches: of both robots, -1 where they are not known yet.
-        waypoints: (n, 6 + m) extended poses, start and goal included.
+        workcell: the cell, with chosen redundant joints.
+        spins: rotation of both pads about their normals, in addition to the file's [rad].
+        branches: start branch of each robot, -1 if not known yet.
+        waypoints: (n, 6 + m) extended poses, start and goal included [m, rad].
         given: earlier additions to the problem's tables, such as bases.
-        bounds: of the decision vector, None where they are not known yet.
-        stand_off: of the pads [m]; None where the usual one is free, or none that was tried.
+        bounds: bounds of the decision vector; None if not known yet.
+        stand_off: stand-off of the pads [m]; None if the usual one is free, or if no tried one is.
     """
 
     workcell: Workcell
@@ -107,8 +107,8 @@ def changes(problem: Problem, found: Draft) -> dict[str, Any]:
 
 
 def decision_bounds(workcell: Workcell) -> tuple[Array, Array]:
-    """Compute half-widths (n_var,) that are scaled together, and limits (2, n_var) of bounds around
-    the workcell's hand-made trajectory."""
+    """Compute half-widths (n_var,) of bounds, which share one factor, and limits (2, n_var) of
+    bounds around the workcell's hand-made trajectory."""
     task, n = workcell.task, len(workcell.task.waypoints)
     poses = [pose_limits(pose, task.orientation) for pose in task.initial]
     joints = np.repeat(joint_limits(workcell), n, axis=1)
@@ -117,7 +117,8 @@ def decision_bounds(workcell: Workcell) -> tuple[Array, Array]:
 
 
 def _boxes(found: Draft, waypoints: Array) -> Array:
-    """Compute bounds (2, n, 6 + m) of waypoints (n, 6 + m), with decimals that the reader takes."""
+    """Compute bounds (2, n, 6 + m) of waypoints (n, 6 + m), rounded to decimals that the reader
+    accepts."""
     bounds = np.array([waypoints - DRAFT_ROOM, waypoints + DRAFT_ROOM])
     if found.bounds is not None:
         both, m = (found.bounds.lower, found.bounds.upper), len(found.workcell.task.redundant)
@@ -126,8 +127,8 @@ def _boxes(found: Draft, waypoints: Array) -> Array:
 
 
 def _as_waypoints(x: Array, waypoints: Array, m: int) -> Array:
-    """Compute extended waypoints (n, 6 + m) of a decision vector in which everything between the
-    ends, and all values of redundant joints, is free."""
+    """Compute extended waypoints (n, 6 + m) of a decision vector in which every inner waypoint and
+    all values of redundant joints are free."""
     n = len(waypoints)
     placed = waypoints.copy()
     placed[1:-1, :POSE_SIZE] = x[: POSE_SIZE * (n - 2)].reshape(n - 2, POSE_SIZE)
@@ -136,5 +137,5 @@ def _as_waypoints(x: Array, waypoints: Array, m: int) -> Array:
 
 
 def _plain(values: Array) -> Any:
-    """Convert to lists of numbers, none of them -0.0."""
+    """Convert values to lists of numbers without -0.0."""
     return (values + 0.0).tolist()

@@ -1,4 +1,4 @@
-"""Ways for one arm to hold the box: spins of its pad, start postures, and their paths to the goal.
+"""Holds of one arm: spin of its pad, start posture, and the path of the arm to the goal.
 
 Many postures are computed side by side, because spins, bases and branches are compared before
 anything is compiled.
@@ -28,7 +28,7 @@ from symbolic.records import Contact
 from symbolic.records.poses import box_placement
 
 GUIDE_POSES = 25
-"""Poses of a guide that postures are followed along."""
+"""Number of poses of a guide, a path along which postures are followed."""
 
 
 def possible_spins(contact: Contact, spins: Array) -> Array:
@@ -79,47 +79,49 @@ def clear_spins(query: HoldQuery, kinematics: ArmKinematics, spins: Array) -> Ar
 
 
 def initial_arc(start: Array, goal: Array, bow: Array) -> Array:
-    """Compute a path (GUIDE_POSES, 6 + m) from one extended pose to another, bowing out by (3,) in
-    the middle."""
+    """Compute a path (GUIDE_POSES, 6 + m) from one extended pose to another that is displaced by
+    `bow` (3,) [m] in the middle."""
     poses = np.linspace(start, goal, GUIDE_POSES)
     poses[:, :3] += np.sin(np.linspace(0.0, np.pi, GUIDE_POSES))[:, None] * bow
     return poses
 
 
 STARTS = 768
-"""Random starts of the search for postures."""
+"""Number of random starts of the search for postures."""
 
 SEARCH_STEPS = 50
-"""Newton steps of the search."""
+"""Number of Newton steps of the search."""
 
 SEARCH_DAMPING = 1e-3
-"""Damping of these steps."""
+"""Damping of these Newton steps."""
 
 GUIDES = np.array(
     [[0, 0, 0], [0, 0, 0.2], [0, 0, 0.4], [0.25, 0, 0], [-0.25, 0, 0], [0, 0.25, 0], [0, -0.25, 0]]
 )
-"""How far guides bow out from the straight line at its middle [m]; collisions do not count."""
+"""Displacements of guides from the straight line at its middle [m]. Collisions do not count along
+guides."""
 
 SAME_POSTURE = 0.05
-"""Postures nearer than this in every joint are one [rad], of an arm of six joints."""
+"""Postures of a six-joint arm count as one if they differ by less in every joint [rad]."""
 
 SAME_REDUNDANT = 0.3
-"""The same of an arm with redundant joints."""
+"""The same limit for an arm with redundant joints [rad]."""
 
 SPIN_OF_FILE = 0.1
-"""Score for keeping the spin of the file."""
+"""Score for keeping the spin in the file."""
 
 LENGTH_COST = 0.3
-"""Cost of the joints' way between start and goal, in a straight line [1/rad]."""
+"""Cost of the straight joint path between start and goal [1/rad]."""
 
 ENOUGH_HOLDS = 96
-"""Ways to hold of one arm after which no further guide is tried: the first are the straightest."""
+"""After so many holds of one arm no further guide is tried; the first guides are the
+straightest."""
 
 MOST_HOLDS = 24
-"""Ways to hold of one arm that are kept, the best first."""
+"""Largest number of holds of one arm that are kept, the best first."""
 
 LIMIT_MARGIN = 0.02
-"""Distance to joint limits of a first path [rad]."""
+"""Distance of a first path from joint limits [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,8 +129,9 @@ class Hold:
     """One way for one arm to hold the box.
 
     Attributes:
-        spin: beside that of the file [rad].
-        q_start, q_goal: (joints,) postures at both ends of the carry, joined by a guide.
+        spin: rotation of the pad about its normal, in addition to the file's [rad].
+        q_start, q_goal: (joints,) postures at both ends of the carry, which a guide connects [rad
+            or m].
         score: larger is better.
     """
 
@@ -140,17 +143,18 @@ class Hold:
 
 @dataclass
 class HoldSearch:
-    """Result of the search for ways to hold with one arm.
+    """Result of the search for the holds of one arm.
 
     Attributes:
-        holds: the best first.
-        within: postures that hold the box at the start, within limits and away from singularities.
-        free: of these free of collisions.
-        joints: how often each joint was beyond its limits, by index.
-        pairs: pairs in the way at the start, or where none is led to the goal there.
-        kept: largest share of the straight line that a free posture follows.
-        stopped: why that one goes no farther.
-        manipulability: largest at the start among postures within limits [m^3].
+        holds: the holds, best first.
+        within: number of postures that hold the box at the start, within limits and away from
+            singularities.
+        free: number of these postures that are free of collisions.
+        joints: number of postures in which each joint was beyond its limits, by index.
+        pairs: number of collisions by pair at the start; at the goal if no posture reaches it.
+        kept: largest share of the straight line that a collision-free posture follows.
+        stopped: reason why this posture cannot be followed farther.
+        manipulability: largest manipulability at the start of a posture within limits [m^3].
     """
 
     holds: list[Hold] = field(default_factory=list)
@@ -165,16 +169,16 @@ class HoldSearch:
 
 @dataclass(frozen=True)
 class HoldQuery:
-    """What an arm has to hold.
+    """The box poses that an arm has to hold, and the effort of the search.
 
     Attributes:
-        start, goal: (6,) box poses.
-        spins: of the pad beside that of the file [rad].
-        judge: of collisions; None: they do not count.
-        starts: random starts of the search for postures.
-        guides: how many of `GUIDES` are tried.
-        common: (2, k) joints that move both arms, at the start and at the goal [rad or m]; None:
-            they are free, as the other redundant ones.
+        start, goal: (6,) box poses [m, rad].
+        spins: rotations of the pad about its normal, in addition to the file's [rad].
+        judge: checker of collisions; None if collisions do not count.
+        starts: number of random starts of the search for postures.
+        guides: number of `GUIDES` that are tried.
+        common: (2, k) positions of the joints that move both arms, at the start and at the goal
+            [rad or m]; None if they are free like other redundant joints.
     """
 
     start: Array
@@ -187,7 +191,7 @@ class HoldQuery:
 
 
 def find_holds(query: HoldQuery, kinematics: ArmKinematics, rng: np.random.Generator) -> HoldSearch:
-    """Find the holds with which an arm can carry the box from start to goal, the other arm left
+    """Find the holds with which an arm can carry the box from start to goal. The other arm is left
     out."""
     finder = _Finder(query, kinematics, rng)
     found, contact = finder.found, kinematics.workcell.contacts[kinematics.arm]
@@ -207,7 +211,7 @@ def find_holds(query: HoldQuery, kinematics: ArmKinematics, rng: np.random.Gener
 
 
 class _Finder:
-    """The search for one arm's ways to hold.
+    """The search for one arm's holds.
 
     Attributes:
         found: the result so far.
@@ -221,7 +225,7 @@ class _Finder:
         self._orientation = kinematics.workcell.task.orientation
 
     def start_postures(self, T_box_joint: Sequence[Array]) -> tuple[Array, NDArray[np.intp]]:
-        """Find distinct postures at the start and the index of each one's spin."""
+        """Find distinct postures at the start, and the index of the spin of each."""
         kinematics, found, start = self.kinematics, self.found, self.query.start
         T_world_box = box_placement(self._orientation, start)
         which = np.arange(self.query.starts) % len(T_box_joint)
@@ -255,8 +259,8 @@ class _Finder:
         return q[kept], which[kept]
 
     def colliding(self, pose: Array, q: Array) -> NDArray[np.bool_]:
-        """Return (n,) True for colliding postures (n, joints) that hold the box at a pose; count
-        the pairs."""
+        """Return (n,) True for postures (n, joints) that collide while they hold the box at a pose.
+        Collisions are counted by pair."""
         judge, arm = self.query.judge, self.kinematics.arm
         if judge is None or not len(q):
             return np.zeros(len(q), dtype=bool)
@@ -270,12 +274,13 @@ class _Finder:
         return hit
 
     def lead(self, spin: Array, T_box_joint: Array, q: Array) -> None:
-        """Follow postures (n, joints) along guides to the goal, until enough arrive; add those as
+        """Follow postures along guides to the goal, until enough arrive. Those that arrive become
         holds.
 
         Args:
             spin: (n,) spin of each posture [rad].
-            T_box_joint: (n, 4, 4) of each posture.
+            T_box_joint: (n, 4, 4) last joint in the box frame, for each posture.
+            q: (n, joints) postures [rad or m].
         """
         start, goal = self.query.start, self.query.goal
         waiting = np.arange(len(q))
@@ -300,7 +305,8 @@ class _Finder:
             waiting = np.delete(waiting, arrived)
 
     def _followed(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
-        """Return the rows that arrive, joint paths (m, n, joints) and scores (n,)."""
+        """Return the indices of the postures that arrive, their joint paths (m, n, joints) and
+        scores (n,)."""
         kinematics, redundant = self.kinematics, list(self.kinematics.redundant)
         ends = None
         if redundant:  # half of them keep their redundant joints, half move them elsewhere
@@ -328,7 +334,7 @@ class _Finder:
         return arrived, path, self._score(path, room, measure)
 
     def _stop(self, q: Array, measure: float, reaches: bool) -> str:
-        """Return the reason why a posture (joints,) is not part of a path."""
+        """Return the reason why a posture (joints,) cannot be part of a path."""
         kinematics = self.kinematics
         if not reaches:
             return "it does not reach farther in one motion"
@@ -341,8 +347,8 @@ class _Finder:
         return f"{joint} is at its limit there"
 
     def _resolved(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
-        """Follow as `_followed`, with redundant joints resolved; only the ends count, because the
-        planned path between them may differ."""
+        """Follow postures like `_followed`, with redundant joints resolved at every pose. Only the
+        ends count, because the planned path between them may differ."""
         ends = None
         if self.query.common is not None:
             ends = q[:, list(self.kinematics.redundant)]
@@ -355,19 +361,20 @@ class _Finder:
         return arrived, path, self._score(path, room, measure)
 
     def _place_common(self, ends: Array) -> None:
-        """Set the common joints among the redundant ones (n, redundant) to where they end."""
+        """Set the common joints among the redundant joints (n, redundant) to their positions at the
+        goal."""
         if self.query.common is not None:
             columns = [self.kinematics.redundant.index(k) for k in self.kinematics.common]
             ends[:, columns] = self.query.common[1]
 
     def _room(self, path: Array) -> Array:
-        """Compute the least distance (m, n) of joint paths (m, n, joints) to a joint limit."""
+        """Compute the least distance (m, n) to a joint limit along joint paths (m, n, joints)."""
         beyond = np.minimum(path - self.kinematics.lower, self.kinematics.upper - path)
         return np.asarray(beyond.min(axis=2))
 
     def _score(self, path: Array, room: Array, measure: Array) -> Array:
-        """Score (n,) paths by their distance from limits and singular postures, and by the
-        shortness between the ends."""
+        """Score paths (n,) by their distance from limits and singular postures, and by the distance
+        between their ends."""
         comfort = np.clip(room.min(axis=0), 0.0, 0.6) / 0.6
         away = np.minimum(measure.min(axis=0) / (4.0 * self.kinematics.least), 1.0)
         apart = np.linalg.norm(path[-1] - path[0], axis=1)
@@ -375,7 +382,7 @@ class _Finder:
 
 
 def manipulability_hint(kinematics: ArmKinematics, found: str) -> str:
-    """Describe a manipulability that is too small, with the key of its limit."""
+    """Return a sentence on a manipulability that is too small, with the key of its limit."""
     robot = kinematics.workcell.robots[kinematics.arm]
     return (
         f"abs(det J) {found}, too near a singular posture; allowed is {MANIPULABILITY_MARGIN:g} "
@@ -384,11 +391,11 @@ def manipulability_hint(kinematics: ArmKinematics, found: str) -> str:
 
 
 def _diverse(holds: Sequence[Hold], compared: int) -> list[Hold]:
-    """Sort holds so that those unlike all earlier ones come first; of holds that differ only in the
-    spin and a joint about the same axis, keep the best.
+    """Sort holds such that holds unlike all earlier ones come first. Of holds that differ only in
+    the spin and in a joint about the same axis, the best is kept.
 
     Args:
-        compared: joints that distinguish holds, from the first.
+        compared: number of joints, from the first, that distinguish holds.
     """
     first: list[Hold] = []
     later: list[Hold] = []

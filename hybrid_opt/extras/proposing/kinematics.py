@@ -16,19 +16,19 @@ from symbolic.records import Contact, Robot, Workcell
 from symbolic.records.poses import inverse, pose_matrix
 
 REACHED = 1e-6
-"""Pose residual of a reached posture [m, rad]."""
+"""A posture counts as reached if its pose residual is smaller [m, rad]."""
 
 STEP_LIMIT = 0.4
 """Largest change of a joint in one step [rad]."""
 
 TRACKING_STEPS = 4
-"""Newton steps from one pose of a path to the next."""
+"""Number of Newton steps from one pose of a path to the next."""
 
 DRIFT_SHARE = 0.03
-"""Share of the way to the middle of their ranges that joints drift from pose to pose."""
+"""Share of the way to the middle of their ranges by which joints drift from pose to pose."""
 
 MANIPULABILITY_MARGIN = 1.1
-"""Least manipulability of a way to hold, over that of the cell."""
+"""Least manipulability of a hold, over the least of the cell."""
 
 JUMP = 0.5
 """Largest change of a joint between poses of a path [rad]."""
@@ -40,8 +40,8 @@ class Postures:
 
     Attributes:
         q: (n, joints) [rad or m].
-        residual: (n,) from the pose that was wanted [m, rad].
-        determinant: (n,) det J of the joints that follow [m^3]; where its sign changes along a
+        residual: (n,) pose residual [m, rad].
+        determinant: (n,) det J of the six joints that follow [m^3]. If its sign changes along a
             path, the arm passes a singular posture.
     """
 
@@ -56,16 +56,17 @@ class Postures:
 
 
 class ArmKinematics:
-    """One arm of a cell as numbers.
+    """Numeric kinematics of one arm of a cell.
 
     Attributes:
         workcell: the cell.
         arm: index of the arm.
-        geometry: its joints.
-        redundant: indices of the joints that stay where they are; the other six follow the box.
-        common: indices of those that move the other arm too, in the order of the task.
+        geometry: joints of the arm.
+        redundant: indices of the redundant joints; the other six follow the box.
+        common: indices of the redundant joints that move the other arm too, in the order of the
+            task.
         lower, upper: (joints,) limits [rad or m].
-        least: manipulability of a first path.
+        least: least manipulability of a first path [m^3].
     """
 
     def __init__(self, workcell: Workcell, arm: int, geometry: ArmGeometry | None = None) -> None:
@@ -78,13 +79,13 @@ class ArmKinematics:
         self.least = workcell.robots[arm].min_manipulability * MANIPULABILITY_MARGIN
 
     def moved(self, T_world_root: Array) -> ArmKinematics:
-        """Return the arm at another base."""
+        """Return the arm with another placement T_world_root (4, 4)."""
         geometry = replace(self.geometry, T_world_root=T_world_root)
         return ArmKinematics(self.workcell, self.arm, geometry)
 
     def held(self, spin: float = 0.0) -> Array:
-        """Compute T_box_joint (4, 4): the last joint of the arm in the frame of the box that it
-        holds, its pad turned about its normal by an angle [rad]."""
+        """Compute T_box_joint (4, 4), the arm's last joint in the frame of the box that it holds,
+        with the pad rotated about its normal by `spin` [rad]."""
         contact = self.workcell.contacts[self.arm]
         # The geometry's own contact is replaced by the one asked for.
         T_pad_joint = inverse(contact.T_box_pad) @ inverse(self.geometry.T_joint_box)
@@ -92,7 +93,7 @@ class ArmKinematics:
 
     @property
     def span(self) -> Array:
-        """(2, joints) the limits, within half a turn either way [rad or m]."""
+        """(2, joints) joint limits, clipped to half a turn in both directions [rad or m]."""
         return np.array([np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)])
 
     def drawn(self, count: int, rng: np.random.Generator) -> Array:
@@ -121,8 +122,8 @@ class ArmKinematics:
         return np.concatenate([points, axes], axis=2), T
 
     def jacobian(self, frames: Array, T: Array) -> Array:
-        """Compute the Jacobian (n, 6, joints) of the last joint's origin, world axes, from the
-        results of `chain`."""
+        """Compute the Jacobian (n, 6, joints) of the last joint's origin, along world axes, from
+        the results of `chain`."""
         points, axes = frames[:, :, :3], frames[:, :, 3:]
         turning = np.array(self.geometry.turning)[:, None]
         across = np.cross(axes, T[:, None, :3, 3] - points)
@@ -130,17 +131,20 @@ class ArmKinematics:
         return np.concatenate([linear, np.where(turning, axes, 0.0)], axis=2).transpose(0, 2, 1)
 
     def side(self, q: Array) -> float:
-        """Return the sign of det J in a posture (joints,): a path on which it changes passes a
+        """Return the sign of det J in a posture (joints,). A path on which it changes passes a
         singular posture."""
         return float(
             np.sign(np.linalg.det(self.jacobian(*self.chain(q[None]))[0][:, self.following]))
         )
 
     def solve(self, q: Array, target: Array, steps: int, damping: float = 0.0) -> Postures:
-        """Solve postures (n, joints) by Newton's method for placements (n, 4, 4) of the last joint.
+        """Find postures with which the last joint has the wanted placements, by Newton's method.
 
         Args:
-            damping: 0 for pure Newton steps; small values keep far starts on course.
+            q: (n, joints) initial postures [rad or m].
+            target: (n, 4, 4) wanted placements of the last joint in the world.
+            steps: number of steps.
+            damping: 0 for pure Newton steps; small values stabilise starts far from a solution.
         """
         q = np.array(q, dtype=float)
         for step in range(steps + 1):
@@ -158,9 +162,12 @@ class ArmKinematics:
         return Postures(q, residual, np.linalg.det(J))
 
     def track(self, q: Array, target: Array, held: Sequence[int] = ()) -> Postures:
-        """Find the next posture (n, joints) at placements (n, 4, 4), all joints but those held
-        moving: steps of least norm that drift to the middle of the joints' ranges where the box
-        leaves them free."""
+        """Find the next postures (n, joints) near q at placements (n, 4, 4) of the last joint. All
+        joints move except those in `held`.
+
+        Steps have least norm and drift to the middle of the joint ranges as far as the box leaves
+        joints free.
+        """
         q = np.array(q, dtype=float)
         middle = (self.lower + self.upper) / 2.0
         moving = np.isin(np.arange(q.shape[1]), held, invert=True)
@@ -182,17 +189,18 @@ class ArmKinematics:
     def follow(
         self, q: Array, targets: Array, ends: Array | None = None, resolved: bool = False
     ) -> tuple[Array, NDArray[np.intp], Array]:
-        """Compute postures (n, joints) that follow placements (m, 4, 4) of the last joint.
+        """Follow m placements of the last joint from n postures, pose by pose.
 
         Args:
-            targets: one path for all, or one for each, (m, n, 4, 4).
-            ends: (n, redundant) where the redundant joints are at the end; None: they stay.
-            resolved: whether they go where the joints keep to the middle of their ranges instead;
-                common ones only without `ends`.
+            q: (n, joints) postures at the first placement [rad or m].
+            targets: (m, 4, 4) placements for all postures, or (m, n, 4, 4) for each posture.
+            ends: (n, redundant) final positions of the redundant joints; None if they do not move.
+            resolved: True if redundant joints move freely such that joints stay near the middle of
+                their ranges; common joints only without `ends`.
 
         Returns:
-            Joint paths (m, n, joints); of each posture the number of placements that it reached
-            without a jump; manipulability (m, n), negative beyond a singular posture.
+            Joint paths (m, n, joints); for each posture the number of placements reached without a
+            jump; manipulability (m, n), negative beyond a singular posture.
         """
         m, n = len(targets), len(q)
         path, measure = np.tile(q, (m, 1, 1)), np.zeros((m, n))
@@ -251,7 +259,7 @@ def shoulder_positions(robots: tuple[Robot, Robot]) -> Array:
 
 
 def has_wrist_spin(kinematics: ArmKinematics) -> bool:
-    """Return True if the arm's last joint turns the pad about its normal."""
+    """Return True if the arm's last joint rotates the pad about its normal."""
     geometry, contact = kinematics.geometry, kinematics.workcell.contacts[kinematics.arm]
     T_joint_pad = geometry.T_joint_box @ contact.T_box_pad
     axis = geometry.axes[-1]
@@ -262,14 +270,15 @@ def has_wrist_spin(kinematics: ArmKinematics) -> bool:
 
 
 def _turns(axis: Array, angle: Array) -> Array:
-    """Compute rotations (n, 3, 3) about a unit axis (Rodrigues)."""
+    """Compute rotations (n, 3, 3) by angles (n,) about a unit axis (3,), by Rodrigues' formula."""
     K = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
     sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
     return np.asarray(np.eye(3) + sine * K + (1.0 - cosine) * (K @ K))
 
 
 def _error(target: Array, T: Array) -> tuple[Array, Array]:
-    """Compute Newton's right-hand side (n, 6) and the pose residual (n,)."""
+    """Compute Newton's right-hand side (n, 6) and the pose residual (n,) of placements T (n, 4,
+    4)."""
     R, R_target = T[:, :3, :3], target[:, :3, :3]
     dR = R_target @ R.transpose(0, 2, 1)
     axis = np.stack(

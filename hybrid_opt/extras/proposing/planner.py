@@ -1,14 +1,14 @@
 """A collision-free path of the box with both arms, over the closed chain.
 
-First of straight motions alone: out of the start, over, into the goal. Where none is free,
-RRT-Connect of OMPL (Kuffner and LaValle, ICRA 2000) looks among all poses, from everything that
-straight motions out of start and goal lead to. Both move in the coordinates of the box path, which
-the spline joins later too, not in those of the joints: both arms' joints follow, branch and all,
-and are kept beside every pose that was reached. It is the only module that needs OMPL.
+First straight motions are tried: out of the start, across, into the goal. If none is free,
+RRT-Connect of OMPL (Kuffner and LaValle, ICRA 2000) searches among all poses, from every pose that
+straight motions out of start and goal reach. Both move in the coordinates of the box path, which
+the later spline has too, and not in joint coordinates. The joints of both arms follow and stay on
+their branches; they are stored with every pose. This is the only module that needs OMPL.
 
-Of the closed chain, both arms and the box that they hold, the box pose and the redundant joints'
-values are free; the six other joints of each arm follow by Newton's method from the pose before, so
-that an arm never changes its branch.
+The closed chain consists of both arms and the box that they hold. Its free coordinates are the box
+pose and the redundant joints. The six other joints of each arm follow by Newton's method from the
+pose before, so an arm never changes its branch.
 """
 
 from __future__ import annotations
@@ -32,19 +32,19 @@ from symbolic.records import POSE_SIZE, Workcell
 from symbolic.records.poses import box_placement, inverse
 
 PATH_STEP = 0.02
-"""Distance between configurations that are looked at, see `LEVERS` [m]."""
+"""Distance between configurations that are checked along a path [m], as `distance` measures it."""
 
 LEVER = 0.3
-"""Length that a radian of the box's turn counts beside a distance [m]."""
+"""Length that a rotation of the box by a radian counts in a distance [m]."""
 
 REDUNDANT_LEVER = 0.2
-"""Length that a radian of a redundant joint counts [m]."""
+"""Length that a motion of a redundant joint by a radian counts in a distance [m]."""
 
 TOGETHER = 8
-"""Configurations that are judged at once."""
+"""Number of configurations that are checked together."""
 
 CHAIN_RESIDUAL = 1e-6
-"""Pose residual of a closed chain [m, rad]."""
+"""Largest pose residual of a closed chain [m, rad]."""
 
 CHAIN_NEWTON_STEPS = 8
 
@@ -55,7 +55,7 @@ class ChainConfiguration:
 
     Attributes:
         extended: (6 + m,) box pose [m, rad] and redundant joints [rad or m].
-        q: per arm the joints (n,) [rad or m].
+        q: joints (n,) of each arm [rad or m].
     """
 
     extended: Array
@@ -63,7 +63,7 @@ class ChainConfiguration:
 
 
 class _Follower:
-    """One arm with pinocchio's numbers."""
+    """One arm of the closed chain, with Pinocchio's numeric model."""
 
     def __init__(self, many: ArmKinematics, hold: Hold, model: pin.Model) -> None:
         robot = many.workcell.robots[many.arm]
@@ -80,7 +80,8 @@ class _Follower:
         self.lower, self.upper = many.lower + LIMIT_MARGIN, many.upper - LIMIT_MARGIN
 
     def close(self, T_world_box: Array, extended: Array, q: Array) -> Array | str:
-        """Return the joints near q that hold the box there, or a text that names the obstacle."""
+        """Return the joints near q with which the arm holds the box at T_world_box, or a text with
+        the reason why there are none."""
         target = self.T_root_world @ T_world_box @ self.T_box_joint
         before, q = q, q.copy()
         for joint, place in self.redundant:
@@ -115,12 +116,12 @@ class _Follower:
 
 
 class ClosedChain:
-    """Both arms with one way to hold the box. Not to be shared between threads.
+    """Both arms with one pair of holds. Threads must not share one.
 
     Attributes:
-        judge: checks collisions.
+        judge: checker of collisions.
         looked: number of checked configurations.
-        refused: number of refusals by reason, collisions excluded.
+        refused: number of refused configurations by reason, collisions excluded.
     """
 
     def __init__(
@@ -133,8 +134,10 @@ class ClosedChain:
         """Prepare both arms.
 
         Args:
-            workcell: with its redundant joints chosen.
-            models: of both arms (`symbolic.read.arms.arm_model`).
+            workcell: the cell, with chosen redundant joints.
+            judge: checker of collisions.
+            holds: hold of each arm.
+            models: Pinocchio model of each arm (`symbolic.read.arms.arm_model`).
         """
         self.judge, self.looked = judge, 0
         self._orientation = workcell.task.orientation
@@ -145,7 +148,8 @@ class ClosedChain:
         ]
 
     def close(self, extended: Array, q: tuple[Array, Array]) -> ChainConfiguration | None:
-        """Return the configuration near given joints; collisions do not count."""
+        """Return the configuration at an extended pose (6 + m,) near joints q; None if the chain
+        does not close. Collisions do not count."""
         T_world_box = box_placement(self._orientation, extended[:POSE_SIZE])
         found = []
         for arm, near in zip(self._arms, q, strict=True):
@@ -159,15 +163,16 @@ class ClosedChain:
     def close_many(
         self, extended: Array, q: tuple[Array, Array], steps: int = TRACKING_STEPS
     ) -> tuple[tuple[Array, Array], NDArray[np.bool_]]:
-        """Return configurations near given joints, all at once; collisions do not count.
+        """Close the chain at n extended poses together, near given joints. Collisions do not count.
 
         Args:
-            extended: (n, 6 + m).
-            q: per arm (n, joints).
-            steps: of Newton's method, at most.
+            extended: (n, 6 + m) extended poses.
+            q: joints (n, joints) of each arm [rad or m].
+            steps: largest number of Newton steps.
 
         Returns:
-            Per arm the joints (n, joints), and which configurations (n,) are closed within limits.
+            Joints (n, joints) of each arm, and (n,) True for configurations that close within joint
+            limits.
         """
         T_world_box = box_placement(self._orientation, extended[:, :POSE_SIZE])
         closed, found = np.ones(len(extended), dtype=bool), []
@@ -183,7 +188,8 @@ class ClosedChain:
         return (found[0], found[1]), closed
 
     def along(self, begin: ChainConfiguration, path: Array) -> Iterator[ChainConfiguration]:
-        """Follow extended poses (n, 6 + m) as far as they are free; the first is where to begin."""
+        """Yield configurations along extended poses (n, 6 + m) as long as they are free. The first
+        pose is that of `begin`."""
         batch: list[ChainConfiguration] = []
         place: ChainConfiguration | None = begin
         for extended in path:
@@ -203,14 +209,14 @@ class ClosedChain:
     def along_many(
         self, begins: Sequence[ChainConfiguration], paths: Array
     ) -> list[list[ChainConfiguration]]:
-        """Follow paths side by side, each as far as it is free.
+        """Follow k paths side by side, each as far as it is free.
 
         Args:
-            begins: a configuration at the begin of each path.
-            paths: (k, n, 6 + m) extended poses, `PATH_STEP` apart or less.
+            begins: configuration at the beginning of each path.
+            paths: (k, n, 6 + m) extended poses, at most `PATH_STEP` apart.
 
         Returns:
-            The configurations along each path, its begin first.
+            Configurations along each path, beginning included.
         """
         found = [[begin] for begin in begins]
         alive = np.arange(len(begins))
@@ -232,8 +238,8 @@ class ClosedChain:
     def between(
         self, first: ChainConfiguration, last: ChainConfiguration, path: Array
     ) -> list[ChainConfiguration] | None:
-        """Return the configurations along a path (n, 6 + m) between two, None if not all are free,
-        or the joints do not lead from the one to the other."""
+        """Return the configurations along a path (n, 6 + m) between two configurations; None if not
+        all are free, or if the joints do not arrive at the second one."""
         share = np.linspace(0.0, 1.0, len(path))[:, None]
         near = [(1.0 - share) * a + share * b for a, b in zip(first.q, last.q, strict=True)]
         q, closed = self.close_many(path, (near[0], near[1]), CHAIN_NEWTON_STEPS)
@@ -249,19 +255,19 @@ class ClosedChain:
         return [first, *places[1:-1], last] if free else None
 
     def reach(self, begin: ChainConfiguration, extended: Array) -> ChainConfiguration | None:
-        """Return the configuration at the end of a straight motion, None if the motion is not
-        free."""
+        """Return the configuration at the end of a straight motion from `begin`; None if the motion
+        is not free."""
         found = self.way(begin, straight(begin.extended, extended))
         return None if found is None else found[-1]
 
     def way(self, begin: ChainConfiguration, path: Array) -> list[ChainConfiguration] | None:
-        """Return the configurations along a path (n, 6 + m) of extended poses from one of them on,
-        None if not all are free."""
+        """Return the configurations along extended poses (n, 6 + m) that begin at `begin`; None if
+        not all are free."""
         found = [begin, *self.along(begin, path[1:])]
         return found if len(found) == len(path) else None
 
     def _free(self, places: list[ChainConfiguration]) -> int:
-        """Count the free configurations before the first that is not."""
+        """Return the number of free configurations before the first that collides."""
         if not places:
             return 0
         pose = np.array([place.extended[:POSE_SIZE] for place in places])
@@ -278,7 +284,7 @@ def metric_weights(size: int) -> Array:
 
 
 def distance(first: Array, second: Array) -> float:
-    """Compute the distance between extended poses [m]."""
+    """Compute the weighted distance between extended poses [m]."""
     return float(np.linalg.norm(metric_weights(len(first)) * (second - first)))
 
 
@@ -290,39 +296,41 @@ def straight(first: Array, second: Array) -> Array:
 
 
 RETREAT = 0.6
-"""Longest straight motion out of the start, or the goal, that is tried [m]."""
+"""Largest length of a straight motion out of the start or the goal [m]."""
 
 SHORT_RETREAT = 0.06
-"""Shortest one that is of use [m]."""
+"""Smallest useful length of such a motion [m]."""
 
 DIRECTIONS = np.array([way for way in product((-1.0, 0.0, 1.0), repeat=3) if any(way)])
-"""Directions of retreats, along the world's axes and between them."""
+"""Directions of straight motions out of start and goal: along the world's axes and between them."""
 
 RETREAT_STOPS = 4
-"""Stride of a retreat's configurations at which the box may turn to the other end's pose."""
+"""Every so many configurations of a retreat the box may rotate to the pose of the other end."""
 
 STRAIGHT_TRIED = 100
-"""Straight motions of the box between two retreats that are tried with the arms."""
+"""Largest number of straight motions of the box between two retreats that are tried with the
+arms."""
 
 LINE_SHARES = np.array([0.5, 0.25, 0.75, 0.375, 0.625, 0.125, 0.875])
-"""Places on them where the box alone is checked first."""
+"""Positions on such a motion at which the box alone is checked first."""
 
 REDUNDANT_ASIDE = 5.0
-"""How far redundant joints may stray per metre of the box [rad/m]."""
+"""Distance by which redundant joints may deviate per metre of deviation of the box [rad/m]."""
 
 MATCH = 1e-3
-"""Largest difference of joints of two trees that meet [rad]: both arms on the same branch."""
+"""Largest difference of joints where two trees meet [rad]: both arms are then on the same
+branch."""
 
 
 @dataclass(frozen=True)
 class AffineSubspace:
-    """The extended poses among which a path is looked for: origin + directions @ y.
+    """The extended poses among which a path is searched: origin + directions @ y.
 
     Attributes:
-        origin: (6 + m,).
-        directions: (6 + m, d), so that distances of y are those of `closed_chain.distance`.
+        origin: (6 + m,) extended pose.
+        directions: (6 + m, d) basis, scaled such that Euclidean distances of y equal `distance`.
         lower, upper: (d,) bounds of y [m].
-        range: longest motion that the planner's trees grow by [m].
+        range: longest motion by which the planner's trees grow [m].
     """
 
     origin: Array
@@ -347,9 +355,10 @@ class Corridor:
     Attributes:
         tilt: largest rotation of the box away from the rotation between start and goal [rad]; 0
             allows none.
-        range: see `AffineSubspace`.
+        range: longest motion by which the planner's trees grow [m].
         aside: largest distance of the box beyond start and goal along each of the world's axes [m].
-        towards: (3,) signed axis along which alone this applies; None for all axes, either way.
+        towards: (3,) the only axis, with sign, along which the box may deviate; None for all axes
+            in both directions.
     """
 
     tilt: float
@@ -359,12 +368,13 @@ class Corridor:
 
 
 def search_subspace(start: Array, goal: Array, stray: Corridor, limits: Array) -> AffineSubspace:
-    """Compute the subspace in which a path from start to goal may lie.
+    """Compute the subspace within which a path from start to goal is searched.
 
     Args:
-        start, goal: (6 + m,).
-        stray: how far it may stray; redundant joints `REDUNDANT_ASIDE` times as far.
-        limits: (m, 2) of the redundant joints [rad or m].
+        start, goal: (6 + m,) extended poses.
+        stray: allowed deviation from the straight motion; redundant joints may deviate
+            `REDUNDANT_ASIDE` times as far.
+        limits: (m, 2) limits of the redundant joints [rad or m].
     """
     size, weight, tilt = len(start), metric_weights(len(start)), stray.tilt
     aside = np.full(size, stray.aside)
@@ -399,13 +409,13 @@ def search_subspace(start: Array, goal: Array, stray: Corridor, limits: Array) -
 
 
 Retreats = tuple[list[list[ChainConfiguration]], list[list[ChainConfiguration]]]
-"""Free configurations from the start and from the goal along the same directions, in order, the end
-itself first."""
+"""Free configurations from the start, and from the goal, along the same directions, in order,
+beginning with the end itself."""
 
 
 def retreats(chain: ClosedChain, ends: tuple[ChainConfiguration, ChainConfiguration]) -> Retreats:
-    """Find straight motions out of start and goal along the world's axes and between them: out of a
-    shelf, for instance."""
+    """Find straight free motions out of start and goal along the world's axes and between them, for
+    instance out of a shelf."""
     ways = DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1)[:, None]
     begins = [place for place in ends for _ in ways]
     away = np.array([place.extended for place in begins])
@@ -419,8 +429,8 @@ def retreats(chain: ClosedChain, ends: tuple[ChainConfiguration, ChainConfigurat
 def straight_paths(
     chain: ClosedChain, out: Retreats, box: PayloadSceneChecker
 ) -> Iterator[list[ChainConfiguration]]:
-    """Yield corners of free paths of a retreat, a straight motion, and the opposite of a retreat
-    along the same direction: the shortest first, one per direction."""
+    """Yield the corners of free paths that consist of a retreat, a straight motion, and the reverse
+    of a retreat in the same direction; the shortest first, one per direction."""
     ways: dict[tuple[bytes, bytes], tuple[float, tuple[int, int], list[ChainConfiguration]]] = {}
     axes = np.flatnonzero(np.count_nonzero(DIRECTIONS, axis=1) == 1)
     same_way = [(k, k) for k in range(len(DIRECTIONS))]
@@ -454,15 +464,15 @@ def plan(
     out_of_time: Callable[[], bool],
     seed: int,
 ) -> list[ChainConfiguration] | None:
-    """Find corners of a free path from start to goal by RRT-Connect; None without one.
+    """Find the corners of a free path from start to goal by RRT-Connect; None if there is none.
 
     Args:
-        chain: the arms in one way of holding.
-        out: where straight motions lead out of start and goal.
-        room: where the path may go.
-        most: configurations that may be looked at.
-        out_of_time: whether to come to an end in any case.
-        seed: of the planner's randomness, at least 1.
+        chain: both arms with one pair of holds.
+        out: configurations that straight motions out of start and goal reach.
+        room: extended poses that the path may use.
+        most: largest number of configurations that may be checked.
+        out_of_time: function that returns True if no time is left.
+        seed: seed of the planner, at least 1.
 
     Raises:
         SettingsError: OMPL is not installed.
@@ -478,8 +488,8 @@ def plan(
             states.append(state)
 
     def joined(first: State, second: State) -> bool:
-        """Return True if the straight motion between two states is free, one of them reached
-        before."""
+        """Return True if the straight motion between two states is free. One of the states was
+        reached before."""
         if first not in places:
             first, second = second, first
         if first not in places:
@@ -505,7 +515,7 @@ def plan(
 def _usable(
     stops: list[ChainConfiguration], place: ChainConfiguration, room: AffineSubspace
 ) -> list[ChainConfiguration]:
-    """Return the configurations that lie apart from an end and within the room."""
+    """Return the configurations that are away from an end and within the room."""
     at = [room.coordinates(stop.extended) for stop in stops]
     return [
         stop
@@ -516,13 +526,13 @@ def _usable(
 
 
 def same(first: ChainConfiguration, second: ChainConfiguration) -> bool:
-    """Return True if both arms stand on the same branches and turns."""
+    """Return True if both arms have the same branches and turns in two configurations."""
     apart = [np.abs(a - b).max() for a, b in zip(first.q, second.q, strict=True)]
     return bool(max(apart) < MATCH)
 
 
 State = tuple[float, ...]
-"""Coordinates that the planner moves in."""
+"""Coordinates in which the planner moves."""
 
 
 def connected(
@@ -533,15 +543,15 @@ def connected(
     ended: Callable[[], bool],
     seed: int,
 ) -> list[State] | None:
-    """Find the states of a path by RRT-Connect; None without one.
+    """Find the states of a path by RRT-Connect; None if there is none.
 
     Args:
         bounds: least and largest states (d,).
-        longest: motion that the planner's trees grow by.
-        joined: whether the straight motion between two states is free.
-        ends: states to begin with, and to end with, one of each.
-        ended: whether to come to an end.
-        seed: of its randomness, at least 1.
+        longest: longest motion by which the planner's trees grow.
+        joined: function that returns True if the straight motion between two states is free.
+        ends: possible first states, and possible last states.
+        ended: function that returns True if the search has to end.
+        seed: seed of the planner, at least 1.
 
     Raises:
         SettingsError: OMPL is not installed.
@@ -561,7 +571,7 @@ def connected(
         return tuple(state[k] for k in range(size))
 
     class Validator(base.MotionValidator):  # type: ignore[misc]
-        """Asks whether motions are free."""
+        """Validator that reports whether a motion is free."""
 
         def checkMotion(self, first: Any, second: Any) -> bool:
             return joined(values(first), values(second))

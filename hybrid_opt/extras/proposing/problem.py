@@ -1,4 +1,4 @@
-"""The problem file: a workcell file without the quantities that are to be proposed."""
+"""The problem file: a workcell file without the quantities that are proposed."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from symbolic.records.problems import Problems
 from symbolic.records.time_law import OPTIMAL
 
 UPRIGHT = 0.7
-"""Share of the vertical from which on an edge of the box counts as upright."""
+"""An edge of the box counts as upright if the cosine between it and the vertical exceeds this."""
 
 LEAST_LEVEL = 0.1
-"""How far a carry goes level, at least, for its direction to count [m]."""
+"""The direction of a carry counts if its level distance exceeds this [m]."""
 
 PROPOSED = ("waypoints", "initial", "redundant")
 """Keys of the task that are always proposed anew."""
 
 DRAFT_ROOM = 0.01
-"""Half-width of bounds before any are known; of no meaning [m, rad]."""
+"""Half-width of provisional bounds, without meaning [m, rad]."""
 
 
 @dataclass(frozen=True)
@@ -45,9 +45,9 @@ class Problem:
     """A problem file.
 
     Attributes:
-        source: the file.
-        text: its content, without the keys to propose.
-        data: its tables, without the keys to propose.
+        source: path of the file.
+        text: text of the file, without the keys to propose.
+        data: tables of the file, without the keys to propose.
     """
 
     source: Path
@@ -56,15 +56,15 @@ class Problem:
 
     @property
     def poses(self) -> tuple[Array, Array]:
-        """(6,) start and goal of the box, the goal's angles on the turns nearest the start's;
-        rotation vectors as they are."""
+        """(6,) start and goal of the box [m, rad]. Angles of the goal are on the turn nearest to
+        the start; rotation vectors stay unchanged."""
         start, goal = (np.array(self.data["task"][key], dtype=float) for key in ("start", "goal"))
         goal[3:] = self.orientation.unwrapped(np.array([start[3:], goal[3:]]))[1]
         return start, goal
 
     @property
     def orientation(self) -> Orientation:
-        """Meaning of the last three numbers of a pose."""
+        """Convention of the last three numbers of a pose."""
         task = self.data["task"]
         if task.get("rotation") != "quaternion":
             return Orientation()
@@ -73,8 +73,8 @@ class Problem:
 
     @property
     def is_machine(self) -> bool:
-        """True if both robots are arms of one machine: other chains of one file at one base, which
-        may be missing."""
+        """True if both robots are arms of one machine: different chains of one file at one base.
+        The base may be missing."""
         first, second = self.data["robots"]
         keys = ("robot", "urdf", "xacro_arguments", "base")
         same = all(first.get(key) == second.get(key) for key in keys)
@@ -159,15 +159,15 @@ class Problem:
         return found
 
     def workcell(self, changes: dict[str, Any] | None = None) -> Workcell:
-        """Read the workcell, with one free waypoint halfway unless `changes` has waypoints.
+        """Read the workcell. Unless `changes` has waypoints, it gets one free waypoint halfway.
 
         Reach is not checked: spins and bases are chosen later.
 
         Args:
-            changes: as for `symbolic.read.editing.completed`.
+            changes: changes of the file's tables, as `symbolic.read.editing.completed` takes them.
 
         Raises:
-            WorkcellError: with all problems of the file.
+            WorkcellError: the file is wrong; the message lists all problems.
         """
         changes = merged({"contacts": self.contacts}, changes or {})
         task = dict(self.data["task"])
@@ -184,13 +184,13 @@ class Problem:
         return load(self.source, text=text.encode(), reach=False)
 
     def completed(self, changes: dict[str, Any], folder: Path) -> str:
-        """Return the file's text, completed, with paths relative to a folder.
+        """Return the text of the file with changes, and with paths relative to a folder.
 
         Args:
-            changes: as for `symbolic.read.editing.completed`.
+            changes: changes of the file's tables, as `symbolic.read.editing.completed` takes them.
 
         Raises:
-            SettingsError: the file is written in a way that cannot be completed.
+            SettingsError: the file is written in a way that cannot be edited.
         """
         here, there = self.source.parent, folder.resolve()
 
@@ -203,10 +203,10 @@ class Problem:
 
 
 def read_problem(path: str | Path) -> Problem:
-    """Read the problem of a file.
+    """Read a problem file.
 
     Raises:
-        WorkcellError: it is no TOML, or required keys are missing.
+        WorkcellError: the file is not TOML, or required keys are missing.
     """
     path = Path(path)
     try:
@@ -259,13 +259,13 @@ def _require_known(table: TableReader) -> None:
 def contact_points(
     size: Array, way: Array, R_world_box: Array, bases: Array | None
 ) -> list[list[float]]:
-    """Compute middles of opposite faces of the box that face the robots, one per robot [m].
+    """Return the centres of two opposite faces of the box, one facing each robot [m].
 
     Args:
         size: (3,) edges of the box [m].
-        way: (2, 6) start and goal.
-        R_world_box: (3, 3) at the start.
-        bases: (2, 3) positions of the robots [m]; None: the faces that the carry passes sideways.
+        way: (2, 6) start and goal of the box [m, rad].
+        R_world_box: (3, 3) rotation of the box at the start.
+        bases: (2, 3) positions of the robots [m]; None for the faces that are lateral to the carry.
     """
     along = way[1, :3] - way[0, :3] if bases is None else bases[0] - bases[1]
     share = np.abs(R_world_box.T @ (along * [1.0, 1.0, 0.0]))
