@@ -1,10 +1,9 @@
 """A complete workcell with a first carry, from robots, payload, start, goal and environment alone.
 
-In this order: both arms' ways to hold the box are compared (spins of the pads, postures), pairs of
-them ranked; a planner looks for a free path of the box with both arms over the closed chain; the
-fewest via-points are taken whose spline is free; the evaluator judges that carry, and random ones
-around it until the bounds hold the wanted share of feasible ones. What is written was judged again
-as it is read from the file.
+The steps: compare the holds of both arms (spins of the pads, postures) and rank pairs of holds;
+search a free path of the box with both arms over the closed chain; fit the fewest via-points whose
+spline is free; evaluate this carry, and random candidates around it until the bounds contain the
+wanted share of feasible ones. The written values are evaluated again as the file states them.
 """
 
 from __future__ import annotations
@@ -58,12 +57,12 @@ from symbolic.path.spline import path_basis
 from symbolic.records import POSE_SIZE, Workcell
 
 SEARCH_ROUNDS = ((0, 12, 0), (500, 12, 2), (2500, 6, 6), (8000, 16, 6), (30000, 24, 6))
-"""Configurations that the planner may look at for a path, 0 for straight motions alone, how many
-pairs of holds get them, and among how many of `STRAYS`: short tries of all before long ones."""
+"""Rounds of the search, short ones first: number of configurations that the planner may check for a
+path (0 for straight motions alone), number of pairs of holds, and number of `STRAYS`."""
 
 OTHER_FACES = 8000
-"""Configurations for a path from which on other faces of the box are pressed too, if both arms can
-hold it by those that face them."""
+"""From this number of configurations per path on, other faces of the box are tried too, if both
+arms can hold it by the faces toward them."""
 
 STRAYS = (
     Corridor(0.0, 0.15, 0.8),
@@ -73,31 +72,32 @@ STRAYS = (
     Corridor(0.0, 0.15, 0.15),
     Corridor(0.3, 0.05, 0.8),
 )
-"""What paths are looked for among; the narrower, the sooner a gap is found, if it is there."""
+"""Corridors within which paths are searched. A gap that lies in a narrower corridor is found
+sooner."""
 
 SIDES = ((0, 0, 1), (0, 1, 0), (0, -1, 0), (1, 0, 0), (-1, 0, 0))
-"""Ways to stray, each by itself, among which further classes are looked for."""
+"""Directions of deviation, one at a time, in which further classes are searched."""
 
 FEW = 3
-"""Via-points that are taken at once; where a path needs more, others are tried first."""
+"""Carries with at most so many via-points are accepted at once. If a path needs more, others are
+tried first."""
 
 LONG_TRIED = 2
-"""Most paths with more via-points that are judged."""
+"""Largest number of paths with more via-points that are evaluated."""
 
 LONGER = 2.5
-"""Multiple of a too short time that a message suggests."""
+"""Factor on a time that was too short, for the time that a message suggests."""
 
 MOST_CLASSES = 100
 
 PLANNING = 0.7
-"""Share of the time after which no path is looked for any more."""
+"""Share of the time after which no further path is searched."""
 
 SPINS = 12
-"""Spins of a pad that are tried."""
+"""Number of spins of a pad that are tried."""
 
 STAND_OFFS = (0.04, 0.03, 0.02, 0.01)
-"""Distances of the pads before and after a carry that are tried where the usual one is blocked [m].
-"""
+"""Stand-offs of the pads that are tried if the usual one is blocked [m]."""
 
 
 def worked() -> float:
@@ -108,17 +108,18 @@ def worked() -> float:
 
 @dataclass(frozen=True)
 class ProposeSettings:
-    """How a carry is looked for.
+    """Settings of the search for a carry.
 
     Attributes:
-        seconds: for all of it.
-        feasible: least and largest share of random candidates within the bounds that is feasible.
-        bases: whether the robots' bases are proposed too; of those in the file only the height
-            counts.
-        classes: carries of different classes that are looked for, as far as the time goes.
-        remedies: whether the least change is looked for with which a box that cannot be held can.
-        clock: what seconds are counted by; other programs' work does not count.
-        used: seconds that were used before, such as by a program's start.
+        seconds: time for the whole search [s].
+        feasible: smallest and largest wanted share of feasible candidates within the bounds.
+        bases: whether the robots' bases are proposed too. Only their height is then taken from the
+            file.
+        classes: number of carries of different classes to search, as far as the time allows.
+        remedies: whether the least changes are searched with which a box can be held that otherwise
+            cannot.
+        clock: function that counts the seconds; by default it ignores the work of other programs.
+        used: seconds used before, for example by the start of a program.
     """
 
     seconds: float = 120.0
@@ -146,17 +147,17 @@ class Proposal:
     """A workcell with a certified carry.
 
     Attributes:
-        problem: where it comes from.
+        problem: the problem.
         found: the proposed values of the workcell.
-        judgement: the evaluator's verdict on the carry, certified between its samples.
-        feasible_share: of random candidates within the bounds.
-        candidates: number of candidates by which that was measured.
-        seconds: time that the proposal took.
-        certified: seconds until the first carry was certified, before bounds around it.
-        q: per arm its joints (n, joints) at the task's samples [rad or m].
-        sides: sides on which it passes what a straight motion of the box would meet.
-        blocked: what is in the way of the pads before the carry or after it, '' where nothing is,
-            or no time was left to look.
+        judgement: the evaluator's verdict on the carry, which is certified between its samples.
+        feasible_share: share of feasible candidates among random ones within the bounds.
+        candidates: number of candidates with which this share was measured.
+        seconds: time of the proposal [s].
+        certified: time until the first carry was certified, before the search for bounds [s].
+        q: joints (n, joints) of each arm at the task's samples [rad or m].
+        sides: for each obstacle of a straight motion, the side on which the carry passes it.
+        blocked: obstacle of the pads' approach or retreat; '' if there is none or no time was left
+            to check.
     """
 
     problem: Problem
@@ -177,15 +178,16 @@ class Proposal:
 
     @property
     def passes(self) -> str:
-        """The obstacles that it passes, and on which side; 'nothing' if a straight motion of the
-        box meets nothing but its support."""
+        """Text on the obstacles that the carry passes and the sides; 'nothing' if a straight motion
+        of the box meets only its support."""
         return " and ".join(self.sides) or "nothing"
 
     def text(self, folder: Path) -> str:
-        """Return the workcell file for a folder: the problem file's text, completed.
+        """Return the text of the workcell file, with paths relative to a folder: the problem file
+        with the proposed values.
 
         Raises:
-            SettingsError: it is written in a way that cannot be completed.
+            SettingsError: the problem file is written in a way that cannot be edited.
         """
         return self.problem.completed(changes(self.problem, self.found), folder)
 
@@ -216,8 +218,22 @@ def propose(
     tell: Callable[[str], None] = lambda text: None,
     progress: ShowProgress = False,
 ) -> Proposal:
-    """Propose a complete workcell for a problem file; of several classes that whose joints go least
-    far. Arguments and errors as for `propose_classes`."""
+    """Propose a complete workcell for a problem file. Of several classes, the one with the shortest
+    joint paths is returned.
+
+    Args:
+        path: a problem file (docs/tutorials/two-robots.md).
+        rng: generator of all random numbers. The same state gives the same proposal unless time
+            runs out.
+        settings: settings of the search; None for the defaults.
+        tell: function that is called with a text on the current step.
+        progress: True for a bar, or a function of the seconds worked and the seconds allowed.
+
+    Raises:
+        WorkcellError: the file is wrong.
+        ProposalError: no carry was found; the message names the obstacle.
+        SettingsError: OMPL is not installed.
+    """
     return propose_classes(path, rng=rng, settings=settings, tell=tell, progress=progress)[0]
 
 
@@ -234,15 +250,17 @@ def propose_classes(
 
     Args:
         path: a problem file (docs/tutorials/two-robots.md).
-        rng: its only randomness. The same state gives the same proposals unless time runs out.
-        settings: number of proposals, among others; None for the defaults: one.
-        tell: called with a text on the current step.
-        progress: True for a bar, or a function of the seconds worked and those allowed; most
-            proposals need a part of them.
+        rng: generator of all random numbers. The same state gives the same proposals unless time
+            runs out.
+        settings: settings of the search, with the number of classes; None for the defaults, one
+            class.
+        tell: function that is called with a text on the current step.
+        progress: True for a bar, or a function of the seconds worked and the seconds allowed. Most
+            proposals need only a part of the allowed time.
 
     Raises:
         WorkcellError: the file is wrong.
-        ProposalError: no carry was found; the text names the obstacle.
+        ProposalError: no carry was found; the message names the obstacle.
         SettingsError: OMPL is not installed.
     """
     settings = settings or ProposeSettings()
@@ -253,7 +271,7 @@ def propose_classes(
 
 @dataclass
 class _Lazy:
-    """A choice of bases that is prepared on first use."""
+    """A choice of bases whose setup is prepared on first use."""
 
     given: dict[str, Any]
     spins: Array
@@ -263,7 +281,7 @@ class _Lazy:
 
 @dataclass
 class _Search:
-    """One proposal in progress."""
+    """One search for proposals in progress."""
 
     problem: Problem
     rng: np.random.Generator
@@ -273,11 +291,11 @@ class _Search:
     begun: float = 0.0
     refusals: list[str] = field(default_factory=list)
     known: set[tuple[int, tuple[str, ...]]] = field(default_factory=set)
-    """Classes that were found: the pair that holds the box, by identity, and the sides."""
+    """Classes that were found: identity of the pair of holds, and the sides passed."""
 
     @property
     def spent(self) -> float:
-        """Seconds so far."""
+        """Time used so far [s]."""
         return self.settings.used + self.settings.clock() - self.begun
 
     @property
@@ -287,7 +305,8 @@ class _Search:
 
     @property
     def too_late(self) -> bool:
-        """True if it is too late for another path: bounds and verdicts take time as well."""
+        """True if too little time is left for another path, because bounds and verdicts take time
+        too."""
         return self.spent > PLANNING * self.settings.seconds
 
     def _say(self, text: str) -> None:
@@ -321,12 +340,12 @@ class _Search:
         return found
 
     def _takes_all(self, effort: int) -> bool:
-        """Return True if a round takes every choice: of bases each, of faces of the box only late
-        ones, as long as those that face the robots can be held."""
+        """Return True if a round uses every choice. Every choice of bases is used; other faces of
+        the box only in late rounds, as long as the faces toward the robots can be held."""
         return self.settings.bases or effort >= OTHER_FACES
 
     def _round(self, lazy: _Lazy, effort: int, most: int, strays: int) -> Iterator[Proposal]:
-        """Run one round with one choice of bases."""
+        """Yield the proposals of one round with one choice of bases."""
         if lazy.setup is None and not lazy.problem:
             self._say("ways to hold the box")
             try:
@@ -358,7 +377,7 @@ class _Search:
                     yield from self._judged(lazy.setup, pair, via, box)
 
     def _is_known(self, pair: Pair, box: PayloadSceneChecker, path: Array) -> bool:
-        """Return True if a carry of the class of these poses (n, 6) was found before."""
+        """Return True if a carry was found before whose class is that of the box poses (n, 6)."""
         return bool(self.known) and (id(pair), box.sides_passed(path)) in self.known
 
     def _failed(self, setups: list[_Lazy]) -> ProposalError:
@@ -379,7 +398,8 @@ class _Search:
         return ProposalError(f"{begin}: {met or 'no path was tried yet'}")
 
     def _remedies(self, spins: Array) -> str:
-        """Describe the least changes with which the box can be held, as far as the time goes."""
+        """Return a text on the least changes with which the box can be held, as far as the time
+        allows."""
         if self.settings.bases or not self.settings.remedies:
             return ""
         self._say("the least change with which the box can be held")
@@ -389,7 +409,7 @@ class _Search:
     def _paths(
         self, setup: Setup, pair: Pair, effort: int, strays: int, box: PayloadSceneChecker
     ) -> Iterator[list[ChainConfiguration] | None]:
-        """Yield corners of paths with one pair of holds."""
+        """Yield the corners of paths with one pair of holds; None for a search without result."""
         if not effort:
             found = straight_paths(pair.chain, pair.retreats, box)
             yield from islice(found, None if self.settings.classes > 1 else 1)
@@ -412,7 +432,8 @@ class _Search:
             )
 
     def _via_points(self, pair: Pair, corners: list[ChainConfiguration]) -> Array | None:
-        """Find the fewest via-points of a path, None without any."""
+        """Find the fewest via-points for a path; None if no number of via-points gives a free
+        spline."""
         self._say("via-points")
         dense = remove_corners(pair.chain, corners, self.rng)
         for count in range(1, MOST_VIA_POINTS + 1):
@@ -424,8 +445,8 @@ class _Search:
     def _judged(
         self, setup: Setup, pair: Pair, via: Array, box: PayloadSceneChecker
     ) -> Iterator[Proposal]:
-        """Yield the proposal with these via-points, unless the evaluator refuses it or its class
-        was found before."""
+        """Yield the proposal with these via-points, unless the evaluator refuses it or its class is
+        known."""
         fitted = np.vstack([pair.start.extended, via, pair.goal.extended])
         if self._is_known(pair, box, _poses(fitted)):
             return
@@ -487,14 +508,15 @@ class _Search:
     def _trial(
         self, setup: Setup, pair: Pair, waypoints: Array, bodies: CellBodies | None = None
     ) -> Trial:
-        """Build the trial of the carry through waypoints (n, 6 + m); bodies as in `Trial`."""
+        """Build the trial of the carry through waypoints (n, 6 + m)."""
         workcell = self._workcell(self._draft(setup, pair, waypoints))
         bodies = bodies or build_cell_bodies(workcell, setup.bodies)
         return Trial(workcell, pair.start.q, bodies, named=False)
 
     def _pads_way(self, trial: Trial) -> tuple[str, float | None]:
-        """Return what blocks the pads before a trial's carry or after it, '' for nothing, and the
-        stand-off that frees them if the cell's does not and the file states none [m]."""
+        """Return the obstacle of the pads before or after a trial's carry, '' for none, and a
+        stand-off [m] without obstacle, if the cell's stand-off is blocked and the file states
+        none."""
         handling = trial.workcell.handling
         blocked = grasp_blocked(trial, handling)
         if blocked and "stand_off" not in self.problem.data.get("handling", {}):
@@ -507,7 +529,7 @@ class _Search:
         return self.problem.workcell(changes(self.problem, found))
 
     def _bounds(self, trial: Trial, until: float) -> Bounds:
-        """Find bounds around a trial's carry until a time [s] after the beginning."""
+        """Find bounds around a trial's carry until `until` seconds after the beginning."""
         unit, limits = decision_bounds(trial.workcell)
         low, high = self.settings.feasible
         sampling = Sampling(

@@ -1,4 +1,4 @@
-"""Proposals ranked by the fastest carries of their classes, each by a small study."""
+"""Ranking of proposals by the fastest carries of their classes, each found by a small study."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def fastest_carry(cell: Cell, evaluations: int, rng: np.random.Generator) -> Car
     """Find the fastest carry of a small study of a drivable cell: one search, one polish.
 
     Raises:
-        SettingsError: no carry that holds was found.
+        SettingsError: no feasible carry was found.
     """
     found = search(cell.drivable(), "nsga2", evaluations=evaluations, rng=rng)
     return polish(found, rng=rng).lowest("duration")
@@ -32,12 +32,14 @@ def rank_homotopy_classes(
     rng: np.random.Generator,
     tell: Callable[[str], None] = lambda text: None,
 ) -> tuple[list[Proposal], Table]:
-    """Rank proposals by the duration of their classes' fastest carries; return them and a table.
+    """Rank proposals by the duration of the fastest carries of their classes. Return the sorted
+    proposals and a table.
 
     Args:
-        evaluations: of the search within each class.
-        rng: its only randomness.
-        tell: called with a text on the current step.
+        proposals: proposals of different classes.
+        evaluations: number of evaluations of the search within each class.
+        rng: generator of all random numbers.
+        tell: function that is called with a text on the current step.
     """
     rows = []
     for k, proposal in enumerate(proposals, 1):

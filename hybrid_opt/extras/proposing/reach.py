@@ -1,10 +1,10 @@
-"""The way of both arms from wherever they stand to where a job begins, or back from its end, the
-box standing.
+"""Paths of both arms from any joint positions to the beginning of a job, or from its end back,
+while the box does not move.
 
-An arm cannot change its branch while it holds the box. Where a job begins in another branch than
-the one that its arm stands in, the change happens here. Both arms move at once, in straight lines
-of their joints from corner to corner; RRT-Connect of OMPL looks for the corners, shortcuts leave
-out what they can, and every line is proven free of collisions.
+An arm cannot change its branch while it holds the box. If a job begins in another branch than the
+arm's present one, the arm changes it on this path. Both arms move at the same time along straight
+lines of their joints from corner to corner. RRT-Connect of OMPL finds the corners, shortcuts remove
+needless ones, and every line is proven free of collisions.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ from symbolic.array import Array
 from symbolic.errors import SettingsError
 
 JOINT_STEP = 0.04
-"""Largest change of a joint between configurations that are looked at [rad or m]."""
+"""Largest change of a joint between configurations that are checked on a line [rad or m]."""
 
 RANGE = 1.5
-"""Longest line that the planner's trees grow by [rad]."""
+"""Longest line by which the planner's trees grow [rad]."""
 
 MOST_LOOKED = 400_000
-"""Configurations that one attempt may look at."""
+"""Largest number of configurations that one attempt may check."""
 
 ATTEMPTS = 8
-"""Attempts, each after a line that could not be proven free."""
+"""Largest number of attempts. A new one follows if a line cannot be proven free."""
 
 PROOF_POINTS = 17
-"""Grid that the proof of a line starts from."""
+"""Number of grid points at which the proof of a line starts."""
 
 _CLOSER = "choose joint positions nearer to the job's"
 
@@ -48,18 +48,19 @@ def plan_reach(job: Job, q: Array, *, rng: np.random.Generator, after: bool = Fa
     """Plan the path of both arms to a job's first position, free of collisions throughout.
 
     Args:
-        q: (joints,) where both arms stand, side by side [rad, or m where a joint slides].
-        rng: its only randomness.
-        after: the way from the job's last position to q instead.
+        job: the job.
+        q: (joints,) joint positions of both arms, side by side [rad, or m for a sliding joint].
+        rng: generator of all random numbers.
+        after: True for the path from the job's last position to q.
 
     Returns:
-        (n, joints) corners, both ends included. Both arms drive straight lines of their joints
-        between them, each line in the same time.
+        (n, joints) corners, both ends included. Between corners both arms move along straight lines
+        of their joints, in the same time.
 
     Raises:
         SettingsError: q does not fit the cell or exceeds a joint's limits, or OMPL is not
             installed.
-        JobError: something collides where the arms stand, or no way was found.
+        JobError: the arms collide at an end of the path, or no path was found.
     """
     cell, end = job.workcell, job.phases[-1 if after else 0].motion.q[-1 if after else 0]
     q = np.asarray(q, dtype=float)
@@ -83,7 +84,7 @@ def plan_reach(job: Job, q: Array, *, rng: np.random.Generator, after: bool = Fa
 
 
 class _Lines:
-    """Straight lines of both arms' joints, the box standing where a job finds or leaves it."""
+    """Straight lines of both arms' joints, with the box at its place before or after a job."""
 
     def __init__(self, job: Job, after: bool) -> None:
         end = -1 if after else 0
@@ -98,12 +99,12 @@ class _Lines:
         return np.tile(self._pose, (len(q), 1)), first, second
 
     def touched(self, q: Array) -> str:
-        """Describe the collision at joints (joints,), '' for none."""
+        """Return a text on the collision at joint positions (joints,); '' for none."""
         touch = self._checker.check(*self._placed(q[None])).first_touch
         return "" if touch is None else str(touch)
 
     def free(self, first: Array, second: Array) -> bool:
-        """Return True if no configuration checked on a line collides."""
+        """Return True if no checked configuration on a line collides."""
         n = int(np.ceil(np.abs(second - first).max() / JOINT_STEP)) + 1
         q = np.linspace(first, second, n + 1)[1:]
         self.looked += len(q)
@@ -122,10 +123,10 @@ class _Lines:
 def _connected(
     lines: _Lines, q: Array, end: Array, bounds: tuple[Array, Array], seed: int
 ) -> list[Array]:
-    """Find corners by RRT-Connect.
+    """Find the corners of a path by RRT-Connect.
 
     Raises:
-        JobError: it finds none.
+        JobError: RRT-Connect finds no path.
     """
     last = lines.looked + MOST_LOOKED
     path = connected(
@@ -144,7 +145,8 @@ def _connected(
 
 
 def _shortened(lines: _Lines, corners: list[Array]) -> list[Array]:
-    """Remove corners greedily while lines that are proven free join the rest."""
+    """Remove corners greedily, as long as the remaining ones can be connected by lines that are
+    proven free."""
     found, at = [corners[0]], 0
     while at < len(corners) - 1:
         ahead = range(len(corners) - 1, at + 1, -1)

@@ -1,5 +1,5 @@
 """The least changes of a problem with which both arms can hold the box at start and goal: bases
-moved or raised, longer tools, another height of the goal. Each is tried, not computed."""
+moved or raised, longer tools, another height of the goal. The changes are found by trying them."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ from symbolic.errors import WorkcellError
 from symbolic.records.poses import rotation_from_rpy
 
 AMOUNTS = (0.05, 0.10, 0.15, 0.20, 0.30, 0.40)
-"""Changes that are tried [m], the least of all kinds first."""
+"""Amounts of change that are tried [m], the smallest of all kinds first."""
 
 ENOUGH_CHANGES = 3
-"""Kinds of changes after which no others are looked for."""
+"""Number of kinds of changes after which the search ends."""
 
 REMEDY_SECONDS = 30.0
-"""Work that the search may take [s]."""
+"""Largest processor time of the search [s]."""
 
 Tables = dict[str, Any]
 
 
 @dataclass(frozen=True)
 class ProblemChange:
-    """A kind of change.
+    """A kind of change of a problem.
 
     Attributes:
-        text: what is changed, with a place for the amount in metres.
-        change: changes a problem's tables by an amount [m].
+        text: description of the change, with a placeholder for the amount in metres.
+        change: function that changes a problem's tables by an amount [m].
     """
 
     text: str
@@ -49,8 +49,8 @@ class ProblemChange:
 
 
 def _towards(problem: Problem) -> Array:
-    """Compute the horizontal unit vectors (2, 3) from both bases to the middle of the carry; of a
-    machine with two arms the same."""
+    """Compute the horizontal unit vectors (2, 3) from both bases to the middle of the carry. For a
+    machine with two arms both are the same."""
     middle = np.mean(problem.poses, axis=0)[:3]
     bases = np.array([robot["base"]["xyz"] for robot in problem.data["robots"]], dtype=float)
     away = (middle - bases) * [1.0, 1.0, 0.0]
@@ -72,7 +72,7 @@ def _raise_bases(problem: Problem, data: Tables, amount: float) -> None:
 
 
 def _lengthen_tools(problem: Problem, data: Tables, amount: float) -> None:
-    """Move the pads along their normals; the tools' bodies stay."""
+    """Move the pads along their normals. The bodies of the tools stay in place."""
     for robot in data["robots"]:
         pad = robot["pad"]
         normal = rotation_from_rpy(pad.get("rpy", [0.0, 0.0, 0.0]))[:, 2]
@@ -99,13 +99,14 @@ PROBLEM_CHANGES = (
 def least_changes(
     problem: Problem, spins: Array, rng: np.random.Generator, is_over: Callable[[], bool]
 ) -> list[tuple[ProblemChange, float]]:
-    """Find changes, and their amounts [m], with which both arms can hold the box; the least first,
-    each kind once.
+    """Find kinds of changes and amounts [m] with which both arms can hold the box, the smallest
+    first, each kind once.
 
     Args:
-        problem: whose file states the bases and the pads' places.
-        spins: of both pads that are tried [rad].
-        is_over: whether to come to an end.
+        problem: problem whose file states the bases and the pads' places.
+        spins: spins of both pads that are tried [rad].
+        rng: generator of random postures.
+        is_over: function that returns True if the search has to end.
     """
     found: dict[ProblemChange, float] = {}
     for amount in AMOUNTS:
@@ -128,7 +129,7 @@ def _can_hold(problem: Problem, spins: Array, rng: np.random.Generator) -> bool:
 def remedies_text(
     problem: Problem, spins: Array, rng: np.random.Generator, is_over: Callable[[], bool]
 ) -> str:
-    """Describe such changes, '' where the file states no bases, or none was found."""
+    """Return a text on the least changes; '' if the file states no bases or none was found."""
     robots = problem.data["robots"]
     if not all(
         "xyz" in robot.get("base", {}) and "xyz" in robot.get("pad", {}) for robot in robots

@@ -1,4 +1,4 @@
-"""A problem prepared for a path search: reach, both arms' ways to hold, and their pairs; else the
+"""A problem prepared for a path search: reach, the holds of both arms, and pairs of holds; or the
 reason why one of these is missing."""
 
 from __future__ import annotations
@@ -41,26 +41,27 @@ from symbolic.records import POSE_SIZE, Task, Workcell
 from symbolic.records.poses import box_placement
 
 RANKING_GUIDES = 3
-"""Guides by which pairs are ranked: straight, bowing up, and far up."""
+"""Number of guides by which pairs are ranked: straight, bowing up, and far up."""
 
 MOST_PAIRS = 32
-"""Pairs that are looked at closer, the best of both arms' own scores."""
+"""Number of pairs that are ranked in detail, the best by the scores of both arms."""
 
 ENOUGH_PAIRS = 4
-"""Pairs after which no further position of the joints that move both arms is tried."""
+"""Number of pairs after which no further position of common joints is tried."""
 
 MOST_POSITIONS = 6
-"""Most positions of these that are tried."""
+"""Largest number of positions of common joints that are tried."""
 
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """A way to hold for each arm.
+    """A hold of each arm.
 
     Attributes:
-        holds: of both arms.
-        start, goal: the closed chain at both ends.
-        chain: the closed chain, whose judge requires as much clearance as both ends have.
+        holds: the holds of both arms.
+        start, goal: configuration of the closed chain at both ends.
+        chain: the closed chain, whose collision checker requires as much clearance as both ends
+            have.
         promise: score; larger is better.
     """
 
@@ -72,20 +73,21 @@ class Pair:
 
     @cached_property
     def retreats(self) -> Retreats:
-        """Where straight motions lead out of start and goal."""
+        """Configurations that straight motions out of start and goal reach."""
         return retreats(self.chain, (self.start, self.goal))
 
 
 def ranked_pairs(
     workcell: Workcell, judge: PoseJudge, holds: Sequence[Sequence[Hold]], ends: tuple[Array, Array]
 ) -> list[Pair]:
-    """Return the pairs whose arms do not meet at start and goal, the most promising first.
+    """Return the pairs of holds whose arms do not collide at start and goal, the most promising
+    first.
 
     Args:
-        workcell: with its redundant joints chosen.
-        judge: of collisions, with nothing to spare.
-        holds: per arm, with the same positions of the joints that move both.
-        ends: start and goal poses of the box (6,).
+        workcell: the cell, with chosen redundant joints.
+        judge: checker of collisions, without a margin.
+        holds: holds of each arm, with the same positions of common joints.
+        ends: start and goal pose (6,) of the box [m, rad].
     """
     scored = [(a.score + b.score, (a, b)) for a in holds[0] for b in holds[1]]
     scored.sort(key=lambda item: -item[0])
@@ -105,7 +107,7 @@ def ranked_pairs(
 
 
 def _place(task: Task, pose: Array, holds: tuple[Hold, Hold], end: int) -> ChainConfiguration:
-    """Build the closed chain at the start (0) or the goal (1)."""
+    """Build the configuration of the closed chain at the start (0) or the goal (1)."""
     joints = [(hold.q_start, hold.q_goal)[end] for hold in holds]
     extended = np.zeros(task.extended_size)
     extended[:POSE_SIZE] = pose
@@ -116,7 +118,7 @@ def _place(task: Task, pose: Array, holds: tuple[Hold, Hold], end: int) -> Chain
 
 
 def _free(judge: PoseJudge, *places: ChainConfiguration) -> bool:
-    """Return True if nothing collides in any of these configurations."""
+    """Return True if none of these configurations collides."""
     return not any(
         judge.colliding(place.extended[None, :POSE_SIZE], place.q[0][None], place.q[1][None])[0]
         for place in places
@@ -124,7 +126,7 @@ def _free(judge: PoseJudge, *places: ChainConfiguration) -> bool:
 
 
 def _free_share(chain: ClosedChain, start: ChainConfiguration, goal: ChainConfiguration) -> float:
-    """Compute the share of the freest guide that the chain can follow."""
+    """Compute the share of the most suitable guide that the chain can follow without collision."""
     best = 0.0
     for bow in GUIDES[:RANKING_GUIDES]:
         path = initial_arc(start.extended, goal.extended, bow)
@@ -135,30 +137,31 @@ def _free_share(chain: ClosedChain, start: ChainConfiguration, goal: ChainConfig
 
 
 POSTURES = 200
-"""Random postures by which redundant joints are chosen, and from which arms reach for the box."""
+"""Number of random postures from which redundant joints are chosen, and from which arms reach for
+the box."""
 
 REACH_STEPS = 40
-"""Newton steps from these."""
+"""Number of Newton steps from these postures."""
 
 NEAREST = 8
-"""Postures from which missing reach is measured, those that come nearest."""
+"""Number of postures from which the missing reach is measured, those that come nearest."""
 
 MISSING = 1e-3
-"""Reach that counts as missing [m]."""
+"""Missing reach below this counts as none [m]."""
 
 TOLD = 3
-"""Most pairs or joints that are named."""
+"""Largest number of pairs or joints that a message names."""
 
 
 @dataclass(frozen=True, eq=False)
 class Setup:
-    """A cell and the pairs of ways to hold in it.
+    """A cell with the pairs of holds in it.
 
     Attributes:
         given: earlier additions to the problem's tables, such as bases.
-        workcell: the cell, its redundant joints chosen.
-        bodies: its arms and bodies.
-        pairs: the most promising first.
+        workcell: the cell, with chosen redundant joints.
+        bodies: arms and bodies of the cell.
+        pairs: pairs of holds, the most promising first.
     """
 
     given: dict[str, Any]
@@ -217,12 +220,13 @@ def prepare(
 
 
 def _progress(searches: Sequence[HoldSearch]) -> tuple[float, ...]:
-    """Order searches of both arms by how far the arm that comes less far comes."""
+    """Return a sort key of the searches of both arms: how far the less successful arm gets."""
     return min((len(one.holds), one.kept, one.free, one.within) for one in searches)
 
 
 def redundancy(problem: Problem, workcell: Workcell) -> dict[str, Any]:
-    """Return the joints beyond six that the file does not name, at the middle of their ranges."""
+    """Return changes that make the joints beyond six that the file does not name redundant, at the
+    middle of their ranges."""
     robots: list[dict[str, Any]] = [{}, {}]
     entries: dict[str, dict[str, Any]] = {}
     common = common_joints(workcell.robots)
@@ -244,8 +248,8 @@ def redundancy(problem: Problem, workcell: Workcell) -> dict[str, Any]:
 
 
 def redundant_joints(workcell: Workcell, arm: int, common: tuple[str, ...]) -> tuple[int, ...]:
-    """Return the indices of an arm's joints without which the other six are conditioned best, in
-    the median of random postures; joints of both arms and prismatic joints in any case."""
+    """Return the indices of those joints of an arm without which the other six are conditioned
+    best, in the median of random postures. Common and sliding joints are always among them."""
     robot = workcell.robots[arm]
     model = arm_model(robot)
     names, beyond = list(model.names)[1:], model.nq - FOLLOWING
@@ -266,7 +270,7 @@ def redundant_joints(workcell: Workcell, arm: int, common: tuple[str, ...]) -> t
 
 
 def box_blocked(judge: PoseJudge, start: Array, goal: Array) -> str:
-    """Describe the obstacle of the box alone at the start or the goal, '' for none."""
+    """Return a text on the obstacle of the box alone at the start or the goal; '' for none."""
     found = []
     for name, pose in (("start", start), ("goal", goal)):
         for body, deep in judge.resting(pose):
@@ -277,8 +281,8 @@ def box_blocked(judge: PoseJudge, start: Array, goal: Array) -> str:
 
 
 def reach_missing(workcell: Workcell, ends: tuple[Array, Array], spins: Array) -> str:
-    """Describe the arm that does not reach its contact at the start or the goal (6,) with any spin,
-    and the missing distance; '' if both reach."""
+    """Return a text on an arm that reaches its contact at the start or the goal (6,) with no spin,
+    and on the missing distance; '' if both arms reach."""
     found = []
     for arm, (name, pose) in product((0, 1), zip(("start", "goal"), ends, strict=True)):
         robot, contact = workcell.robots[arm], workcell.contacts[arm]
@@ -331,7 +335,8 @@ def _arm_missing(kinematics: ArmKinematics, search: HoldSearch) -> str:
 
 
 def _no_pair(query: HoldQuery, judge: PoseJudge, searches: Sequence[HoldSearch]) -> str:
-    """Say which arm cannot hold the box, or which bodies meet where either arm alone is free."""
+    """Return a text on the arm that cannot hold the box, or on the bodies that collide although
+    either arm alone is free."""
     told = [
         _arm_missing(ArmKinematics(judge.geometry.workcell, arm), one)
         for arm, one in enumerate(searches)
@@ -351,7 +356,8 @@ def _no_pair(query: HoldQuery, judge: PoseJudge, searches: Sequence[HoldSearch])
 
 
 def no_path(pairs: Iterable[Pair], refusals: Sequence[str]) -> str:
-    """Describe the planner's most frequent obstacle, and why the evaluator refused its paths."""
+    """Return a text on the most frequent obstacle of the planner, and on the reasons why the
+    evaluator refused its paths."""
     met: Counter[tuple[str, str]] = Counter()
     refused: Counter[str] = Counter()
     for pair in pairs:
@@ -377,7 +383,8 @@ def _pairs(met: Counter[tuple[str, str]]) -> str:
 
 
 def _overlap_hint(met: Counter[tuple[str, str]]) -> str:
-    """Suggest a remedy for links of one robot that meet in every posture."""
+    """Return a remedy for links of one robot that collide in every posture; '' if there are
+    none."""
     owners = [[name.partition("/")[0] for name in pair if "/" in name] for pair in met]
     if not any(len(names) == 2 and names[0] == names[1] for names in owners):
         return ""

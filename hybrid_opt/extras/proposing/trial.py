@@ -1,5 +1,5 @@
-"""Checks before anything is compiled, by CasADi's interpreter: the box alone, postures of the cell,
-and a proposed carry by the evaluator."""
+"""Checks before anything is compiled, with CasADi's interpreter: the box alone, postures of the
+cell, and a proposed carry by the evaluator."""
 
 from __future__ import annotations
 
@@ -37,22 +37,22 @@ from symbolic.records.task import initial_decision
 from symbolic.robot.branches import StartBranch
 
 MARGINS = (0.01, 0.004, 0.0015, 0.0005, 0.0)
-"""Clearances that a first path may keep beyond the cell's tolerance, the widest possible counts
-[m]."""
+"""Clearances beyond the cell's tolerance that a first path may keep [m]. The widest possible one is
+used."""
 
 
 CONTACT_STEP = 0.02
-"""Step along a straight motion of the box at which it is checked for contact [m]."""
+"""Step along a straight motion of the box at which contact is checked [m]."""
 
 LEVEL = 0.1
-"""Least level share of a motion that has a left and a right."""
+"""A motion has a left and a right side if its level share exceeds this."""
 
 
 class PayloadSceneChecker:
-    """The box among the environment, without the arms."""
+    """Collision checker of the box in the environment, without the arms."""
 
     def __init__(self, workcell: Workcell) -> None:
-        """Prepare their shapes."""
+        """Prepare the shapes of box and environment."""
         meshes = MeshReader()
         self._orientation = workcell.task.orientation
         self._met: dict[tuple[bytes, bytes], bool] = {}
@@ -69,19 +69,19 @@ class PayloadSceneChecker:
         )
 
     def is_between(self, begin: Array, end: Array, shares: Array) -> bool:
-        """Return True if the box meets the environment between two poses (6,), at shares (n,) of
-        the straight motion. Cached, because all ways to hold share these motions."""
+        """Return True if the box meets the environment at shares (n,) of the straight motion
+        between two poses (6,). Results are cached, because all holds share these motions."""
         key = begin.tobytes(), end.tobytes()
         if key not in self._met:
             self._met[key] = self.meets(begin + shares[:, None] * (end - begin))
         return self._met[key]
 
     def sides_passed(self, path: Array) -> tuple[str, ...]:
-        """Return the sides on which a path (n, 6) passes what the straight motion between its ends
-        meets, such as 'over post', 'left of post' (looking along the motion), 'between post and
-        wall' or 'through frame'; empty if that is free.
+        """Return the sides on which a path (n, 6) passes the obstacles of the straight motion
+        between its ends, such as 'over post', 'left of post' (looking along the motion), 'between
+        post and wall' or 'through frame'. The result is empty if the straight motion is free.
 
-        What the box meets at an end, such as the board that it stands on, does not count.
+        Bodies that the box touches at an end, such as its support, do not count.
         """
         n = max(int(np.ceil(np.linalg.norm(path[-1, :3] - path[0, :3]) / CONTACT_STEP)), 2)
         straight = self._boxes(np.linspace(path[0], path[-1], n + 1))
@@ -109,9 +109,9 @@ class PayloadSceneChecker:
 def _passage(
     boxes: list[tuple[Piece, ...]], standing: Mapping[str, tuple[Piece, ...]], name: str, way: Array
 ) -> str:
-    """Describe how a box passes a standing body while abreast of it: on which side, across the way
-    (3,), the gap is largest; and whether it is between parts of that body, or between it and
-    another one."""
+    """Return a text on how a box passes a fixed body while beside it: the side with the largest
+    gap, across the direction of motion `way` (3,), and whether the box is between parts of the body
+    or between the body and another one."""
     length = float(np.linalg.norm(way))
     along = way / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
     level = np.array([along[0], along[1], 0.0])
@@ -127,7 +127,7 @@ def _passage(
     abreast = min(boxes, key=lambda box: abs(_reach(box, along) - _reach(box, -along) - middle))
 
     def faces(other: tuple[Piece, ...], side: Array) -> bool:
-        """Return True if the box meets the other body when it moves on to this side."""
+        """Return True if the box meets the other body when it moves to this side."""
         across = along, np.cross(along, side)
         return any(
             _gap(abreast, (piece,), side) >= 0.0
@@ -150,28 +150,28 @@ def _passage(
 
 
 def _gap(box: tuple[Piece, ...], body: tuple[Piece, ...], direction: Array) -> float:
-    """Compute how far a box may move in a direction (3,) before it is abreast of a body [m];
-    negative if it already is."""
+    """Compute how far a box may move in a direction (3,) before it is beside a body [m]; negative
+    if it already is."""
     return -_reach(body, -direction) - _reach(box, direction)
 
 
 def _reach(pieces: tuple[Piece, ...], direction: Array) -> float:
-    """Compute the extent of pieces along a direction (3,) [m]."""
+    """Compute the largest coordinate of pieces along a direction (3,) [m]."""
     return max(float(support(piece, direction)[0]) for piece in pieces)
 
 
 class PoseJudge:
-    """Checks configurations for collisions, with a clearance margin.
+    """Collision checker of configurations, with a clearance margin.
 
     Attributes:
         geometry: the cell's bodies and pairs.
-        margin: clearance beyond the cell's tolerance that counts as a collision [m].
+        margin: a smaller clearance than this beyond the cell's tolerance counts as a collision [m].
         checker: the collision checker.
-        met: number of collisions per pair since it was cleared.
+        met: number of collisions by pair since the counter was cleared.
     """
 
     def __init__(self, geometry: CellGeometry, checker: CollisionChecker, margin: float) -> None:
-        """Store the parts; `judge_of` makes them."""
+        """Store the parts. Use `judge_of` to build a checker for a cell."""
         self.geometry = geometry
         self.margin = margin
         self.met: Counter[tuple[str, str]] = Counter()
@@ -190,7 +190,7 @@ class PoseJudge:
         ]
 
     def with_margin(self, margin: float) -> PoseJudge:
-        """Return the judge with another clearance margin."""
+        """Return the checker with another clearance margin."""
         workcell = self.geometry.workcell
         collision = workcell.collision
         wider = replace(collision, tolerance=collision.tolerance - self.margin + margin)
@@ -206,7 +206,7 @@ class PoseJudge:
         return found.colliding
 
     def arm_colliding(self, arm: int, pose: Array, q: Array) -> NDArray[np.bool_]:
-        """Return (n,) True for collisions of one arm and the box, without the other arm."""
+        """Return (n,) True for collisions of one arm and the box. The other arm is left out."""
         absent = np.zeros((len(q), self.geometry.arms[1 - arm].joints))
         q_1, q_2 = (q, absent) if arm == 0 else (absent, q)
         bounds = self.checker.bounds(pose, q_1, q_2)
@@ -214,8 +214,8 @@ class PoseJudge:
         return self.checker.check(pose, q_1, q_2, bounds).colliding
 
     def resting(self, pose: Array) -> list[tuple[str, bool]]:
-        """Return the environment bodies at the box's pose (6,), and whether the box penetrates each
-        by more than a resting one may."""
+        """Return the environment bodies that the box touches at a pose (6,), and for each True if
+        the box penetrates it deeper than a resting box may."""
         names = [
             (k, pair) for k, pair in enumerate(self.geometry.pair_names) if PAYLOAD_NAME in pair
         ]
@@ -244,7 +244,7 @@ class PoseJudge:
 
 
 def judge_of(bodies: CellBodies) -> PoseJudge:
-    """Build the judge of a cell's collisions, without a margin."""
+    """Build the collision checker of a cell, without a margin."""
     made = bodies.screening
     functions = {
         name: InterpretedFunction(made[name]) for name in made if not name.endswith("motion")
@@ -253,30 +253,31 @@ def judge_of(bodies: CellBodies) -> PoseJudge:
 
 
 SAME_BRANCH = 0.02
-"""Largest difference of joints, up to full turns, between a path's first posture and its branch
-[rad or m]."""
+"""Largest difference between a path's first posture and its branch, up to full turns [rad or m]."""
 
 COARSE = 9
-"""Stride of the samples judged first: most candidates that collide do so there."""
+"""Stride of the samples that are checked first: most candidates that collide do so at one of
+them."""
 
 LOOKED = (1, 3)
-"""Samples, nearest first, that are checked in the first batch, and by the end of the second."""
+"""Number of samples, nearest first, that are checked in the first batch, and until the end of the
+second."""
 
 _PLACED = ("pose", "q_1", "q_2")
 
 CHUNK = 32
-"""Candidates whose samples are held at once."""
+"""Number of candidates whose samples are held in memory together."""
 
 
 class Trial:
-    """A workcell's evaluator without a compiler.
+    """Evaluator of a proposed workcell that needs no compiler.
 
     Attributes:
-        workcell: the cell, its start branches as they were found.
-        branches: per robot its start branch among the ranked ones.
-        bodies: what does not depend on the carry.
-        model: its symbolic model.
-        evaluator: what judges.
+        workcell: the cell, with the start branches that were found.
+        branches: start branch of each robot among the ranked branches.
+        bodies: arms and bodies of the cell, which do not depend on the carry.
+        model: symbolic model of the cell.
+        evaluator: evaluator of candidates.
     """
 
     def __init__(
@@ -289,10 +290,11 @@ class Trial:
         """Build the model and find the start branches.
 
         Args:
-            start: postures (joints,) of both arms that the carry begins with.
-            bodies: of the same cell with another carry, if they are known.
-            named: whether `branches` are looked for; else they are -1 and the postures are taken as
-                they are.
+            workcell: the proposed cell.
+            start: postures (joints,) of both arms at the beginning of the carry [rad or m].
+            bodies: bodies of the same cell with another carry; computed if None.
+            named: True to find the indices of the branches; False to leave them at -1 and use the
+                postures themselves.
 
         Raises:
             BranchLostError: a posture is not among the start branches.
@@ -319,17 +321,21 @@ class Trial:
 
     @property
     def initial(self) -> Array:
-        """(n_var,) the proposed carry."""
+        """(n_var,) decision vector of the proposed carry."""
         return initial_decision(self.workcell.task)
 
     def start_of(self, x: Array) -> tuple[Array, Array]:
-        """Compute both arms' postures (joints,) at the start of a decision vector (n_var,)."""
+        """Compute the postures (joints,) of both arms at the start of a decision vector x
+        (n_var,)."""
         outputs = self.evaluator.outputs(x[None])
         return outputs["q_1"][0, 0], outputs["q_2"][0, 0]
 
     def verdict(self) -> tuple[Judgement, str]:
-        """Evaluate the proposed carry: on its samples, between them, and held still at both ends.
-        Return the verdict and the reason of a failure."""
+        """Evaluate the proposed carry on its samples, between them, and at rest at both ends.
+
+        Returns:
+            The verdict, and the reason of a failure, else ''.
+        """
         judgement, why = self.verdict_on(self.initial)
         told = (
             static_hold_error(self.workcell, self.evaluator.outputs) if judgement.feasible else ""
@@ -339,11 +345,16 @@ class Trial:
         )
 
     def certain(self, x: Array) -> bool:
-        """Return True if a decision vector (n_var,) is feasible, between its samples too."""
+        """Return True if a decision vector x (n_var,) is feasible on its samples and between
+        them."""
         return bool(self.feasible(x[None])[0]) and self.verdict_on(x)[0].feasible
 
     def verdict_on(self, x: Array) -> tuple[Judgement, str]:
-        """Evaluate a decision vector (n_var,) likewise."""
+        """Evaluate a decision vector x (n_var,) on its samples and between them.
+
+        Returns:
+            The verdict, and the reason of a failure, else ''.
+        """
         verdicts = self.evaluator.evaluate(x[None])
         judgement = verdicts.judgement(0, self.evaluator.objective_names)
         if not judgement.feasible:
@@ -381,8 +392,8 @@ class Trial:
         )
 
     def _hit(self, placed: list[Array], rows: NDArray[np.intp]) -> bool:
-        """Return True if one of these samples collides; those with the least bounds are checked
-        first."""
+        """Return True if one of these samples collides. Samples with the smallest distance bounds
+        are checked first."""
         checker = self.evaluator.checker
         pose, q_1, q_2 = (np.ascontiguousarray(values[rows]) for values in placed)
         bounds = checker.bounds(pose, q_1, q_2)
@@ -394,7 +405,8 @@ class Trial:
 
 
 def _satisfied(outputs: dict[str, Array]) -> NDArray[np.bool_]:
-    """Return (n,) True if all constraints but collisions hold at every sample."""
+    """Return (n,) True for candidates that satisfy all constraints except collisions at every
+    sample."""
     finite = np.isfinite(outputs["time"]).all(axis=tuple(range(1, outputs["time"].ndim)))
     return np.asarray(np.all(outputs["violation"] <= 0.0, axis=1) & finite)
 
@@ -416,8 +428,9 @@ def _branch(branches: tuple[StartBranch, ...], q: Array) -> int:
 
 
 def grasp_blocked(trial: Trial, handling: Handling) -> str:
-    """Describe the obstacle of the pads' approach before a trial's carry or of their retreat after
-    it, lift and set-down included; '' for none, or if such pads have no jobs."""
+    """Return a text on the obstacle of the pads' approach before a trial's carry or of their
+    retreat after it, lift and set-down included; '' for none, or if there are no jobs for such
+    pads."""
     cell = replace(trial.workcell, handling=handling)
     if not cell.has_facing_pads:
         return ""

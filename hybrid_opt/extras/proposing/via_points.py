@@ -1,4 +1,4 @@
-"""Via-points through which the quintic spline follows a planned path without collision."""
+"""Via-points with which the quintic spline follows a planned path without collision."""
 
 from __future__ import annotations
 
@@ -22,34 +22,35 @@ from symbolic.path.spline import path_basis
 from symbolic.records import POSE_SIZE
 
 SHORTCUTS = 80
-"""Shortcuts of a path that are tried."""
+"""Number of shortcuts of a path that are tried."""
 
 SHORTER = 0.99
-"""Largest length of a shortcut, as a share of the length that it replaces."""
+"""A shortcut is taken if it is shorter than this share of the length that it replaces."""
 
 MOST_VIA_POINTS = 6
-"""Via-points of a proposal; more make a search long."""
+"""Largest number of via-points of a proposal; more make a search long."""
 
 LEAST_SAMPLES = 60
-"""Places of a spline that are looked at, at least."""
+"""Smallest number of places of a spline that are checked."""
 
 SHIFTS = 12
-"""Random shifts of via-points that are tried where fits collide."""
+"""Number of random shifts of via-points that are tried if fits collide."""
 
 SHIFT = 0.04
-"""Standard deviation of the shifts [m], and in a turn counted by its lever."""
+"""Standard deviation of the shifts [m]; for rotations with the lever of `distance`."""
 
 GENERATIONS = 60
-"""Generations of the evolution strategy that shortens a free spline."""
+"""Number of generations of the evolution strategy that shortens a free spline."""
 
 OFFSPRING = 16
-"""Splines of a generation."""
+"""Number of splines per generation."""
 
 MEASURED = 24
-"""Places of a spline by which the strategy measures its length and looks for collisions."""
+"""Number of places of a spline at which the strategy measures its length and checks collisions."""
 
 BLOCKED = 100.0
-"""Cost of a spline whose places are all out of reach; half as much where all collide [rad]."""
+"""Cost of a spline that is out of reach everywhere; half as much if it collides everywhere
+[rad]."""
 
 
 def path_length(points: Array) -> float:
@@ -58,7 +59,7 @@ def path_length(points: Array) -> float:
 
 
 def joint_length(places: Sequence[ChainConfiguration]) -> float:
-    """Compute the Euclidean length of the path of all joints [rad]."""
+    """Compute the Euclidean length of the path of all joints through configurations [rad]."""
     return path_length(np.array([np.concatenate(place.q) for place in places]))
 
 
@@ -71,7 +72,8 @@ def along(corners: Sequence[ChainConfiguration]) -> Array:
 def remove_corners(
     chain: ClosedChain, corners: Sequence[ChainConfiguration], rng: np.random.Generator
 ) -> list[ChainConfiguration]:
-    """Remove needless corners of a path; return places along it, `planner.PATH_STEP` apart."""
+    """Remove needless corners of a path. Return configurations along it that are
+    `planner.PATH_STEP` apart."""
     dense = [corners[0]]
     for corner in corners[1:]:
         found = chain.way(dense[-1], straight(dense[-1].extended, corner.extended))
@@ -96,15 +98,16 @@ def remove_corners(
 def fit(
     chain: ClosedChain, path: Sequence[ChainConfiguration], count: int, rng: np.random.Generator
 ) -> Array | None:
-    """Find via-points (count, 6 + m) whose spline is free, None without any.
+    """Find via-points (count, 6 + m) whose spline is free; None if none are found.
 
-    Those on the path at even distances, those whose spline is nearest to it, what lies between
-    them, then random shifts of the best.
+    Tried are via-points on the path at even distances, those whose spline is nearest to the path,
+    interpolations between both, and random shifts of the best.
 
     Args:
-        path: from start to goal.
-        count: via-points.
-        rng: of the shifts.
+        chain: both arms with one pair of holds.
+        path: configurations from start to goal.
+        count: number of via-points.
+        rng: generator of the shifts.
     """
     points = np.array([place.extended for place in path])
     steps = [distance(a, b) for a, b in pairwise(points)]
@@ -139,9 +142,9 @@ def fit(
 def shorten_spline(
     chain: ClosedChain, start: ChainConfiguration, waypoints: Array, rng: np.random.Generator
 ) -> Array:
-    """Find waypoints (n, 6 + m) of a free spline with shorter joint paths than the given one.
+    """Find waypoints (n, 6 + m) of a free spline with shorter joint paths than a given free spline.
 
-    Found by an evolution strategy, CMA-ES (Hansen, arXiv 1604.00772), from the given one on.
+    An evolution strategy, CMA-ES (Hansen, arXiv 1604.00772), starts from the given waypoints.
     """
     # Not imported at the top: it brings Matplotlib, and a first carry is there before.
     import cma
@@ -179,8 +182,8 @@ def shorten_spline(
 def _closed_path(
     chain: ClosedChain, start: ChainConfiguration, path: Array
 ) -> Iterator[ChainConfiguration]:
-    """Yield configurations along extended poses (n, 6 + m) as far as the chain closes, collisions
-    ignored."""
+    """Yield configurations along extended poses (n, 6 + m) as long as the chain closes. Collisions
+    are ignored."""
     place: ChainConfiguration | None = start
     yield start
     for extended in path[1:]:
@@ -192,8 +195,9 @@ def _closed_path(
 
 
 def _lengths(chain: ClosedChain, paths: Array, near: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Compute the joint path lengths [rad] along paths (k, n, 6 + m) near a closed one, per arm
-    (n, joints); and what counts beside it, above 0 where a path is blocked (k,)."""
+    """Compute the joint path lengths (k,) [rad] along paths (k, n, 6 + m), with postures near those
+    of a closed path, (n, joints) for each arm; and an additional cost (k,) above 0 for blocked
+    paths."""
     k, n, size = paths.shape
     begin = np.tile(near[0], (k, 1)), np.tile(near[1], (k, 1))
     flat = paths.reshape(-1, size)
@@ -207,7 +211,8 @@ def _lengths(chain: ClosedChain, paths: Array, near: tuple[Array, Array]) -> tup
 
 
 def free_share(chain: ClosedChain, start: ChainConfiguration, waypoints: Array) -> float:
-    """Compute the share of the spline through waypoints (n, 6 + m) before its first collision."""
+    """Compute the share of the spline through waypoints (n, 6 + m) that is free, before its first
+    collision."""
     legs = [distance(a, b) for a, b in pairwise(waypoints)]
     n = max(LEAST_SAMPLES, int(np.ceil(1.2 * sum(legs) / PATH_STEP)))
     path = path_basis(len(waypoints), np.linspace(0.0, 1.0, n)).position @ waypoints
