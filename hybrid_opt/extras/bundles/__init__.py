@@ -1,4 +1,4 @@
-"""Whole jobs as bundles that robot drivers run. docs/reference/bundles.md describes them."""
+"""Bundles of whole jobs that robot drivers run. docs/reference/bundles.md describes them."""
 
 from hybrid_opt.extras.bundles.bundle import Origin, export
 from hybrid_opt.extras.bundles.job_file import BundleOptions

@@ -1,8 +1,8 @@
 """Both arms of a cell as bundles name them: their makers and joints, and one URDF of both with a
 simulator's hardware for ros2_control.
 
-Links and joints of a robot bear its prefix; the arms of one machine share its description and need
-none. Joints that the workcell holds are fixed where it holds them.
+Names of links and joints begin with the robot's prefix. The arms of one machine share its
+description and need no prefix. Joints that the workcell holds are fixed at their positions.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ UR = "UR e-series"
 FRANKA = "Franka"
 
 SIX, SEVEN = 6, 7
-"""Axes of an arm that a language's targets can hold."""
+"""Numbers of axes of an arm that targets in a maker's language support."""
 
 _SIGNS = {
     ABB: re.compile(r"(?<![a-z])(abb|irb|crb|gofa|yumi|swifti)(?![a-z])"),
@@ -60,18 +60,19 @@ def require_arms(
     has_address: bool = False,
     any_arm: bool = False,
 ) -> None:
-    """Refuse a maker's target for arms that it is not for, or that lack what it needs.
+    """Check that arms are of the maker of a target and have everything that it needs.
 
     Args:
-        target: its name, for the message.
+        workcell: the cell with the arms.
+        target: name of the target, for the message.
         maker: `ABB`, `FRANKA` or `UR`.
-        axes: numbers of turning joints that its targets can hold.
-        has_address: whether it has to know where both controllers are.
-        any_arm: whether the user wants it for arms that do not look like the maker's as well.
+        axes: supported numbers of turning joints.
+        has_address: True if the target needs the addresses of both controllers.
+        any_arm: True to accept arms that do not look like the maker's.
 
     Raises:
-        SettingsError: an arm's file, its name, xacro arguments and links name another make, it has
-            another number of joints or one that slides, or its driver has no address.
+        SettingsError: the file, name, xacro arguments or links of an arm name another maker; an arm
+            has another number of joints or a sliding joint; or a driver has no address.
     """
     for robot in workcell.robots:
         if not any_arm and not _SIGNS[maker].search(described(robot)):
@@ -100,16 +101,17 @@ def require_arms(
 SECTION_OF_EACH = (
     "the workcell's section of each robot before the study, or into a file for export --driver"
 )
-"""Where a driver's key may be stated: a stored trajectory keeps the cell that it was found in."""
+"""Text on where a driver's key may be stated. A stored trajectory keeps the cell in which it was
+found."""
 
 
 @dataclass(frozen=True)
 class Lines:
-    """The names by which a target switches and hears hands.
+    """Names of the outputs and inputs by which a target switches hands and reads their state.
 
     Attributes:
-        output, input: patterns of them.
-        meaning: of both, in words.
+        output, input: regular expressions of the names.
+        meaning: description of both names, for messages.
     """
 
     output: str
@@ -117,10 +119,10 @@ class Lines:
     meaning: str
 
     def require(self, workcell: Workcell, target: str) -> None:
-        """Refuse drivers whose names a target does not take; inputs may be left out.
+        """Check that the names of a cell's drivers are valid for a target. Inputs may be left out.
 
         Raises:
-            SettingsError: with the key, and its meaning for the target.
+            SettingsError: a name is not valid; the message states the key and the allowed names.
         """
         for robot in workcell.robots:
             driver = robot.driver
@@ -140,14 +142,14 @@ SERVICES = Lines(
     "/.+",
     "a service of std_srvs/srv/SetBool and a topic of std_msgs/msg/Bool, /NAME each",
 )
-"""Of ROS 2, whatever arms."""
+"""Names of hands in ROS 2, for any arms."""
 
 
 def addressed(workcell: Workcell, addresses: tuple[str, str]) -> Workcell:
-    """Return the cell with the controllers at these host names or IP addresses.
+    """Return the cell with these host names or IP addresses of the controllers.
 
     Raises:
-        SettingsError: one is neither.
+        SettingsError: an address is neither a host name nor an IP address.
     """
     for address in addresses:
         if ADDRESS.problem(address):
@@ -158,7 +160,7 @@ def addressed(workcell: Workcell, addresses: tuple[str, str]) -> Workcell:
 
 
 def described(robot: Robot) -> str:
-    """Return the words of a description that may name its maker, in lower case."""
+    """Return the words of a robot's description that may name its maker, in lower case."""
     urdf = robot_urdf(robot)
     words = [robot.urdf.name, urdf.name, *urdf.links]
     words += [value for _, value in robot.xacro_arguments]
@@ -166,21 +168,23 @@ def described(robot: Robot) -> str:
 
 
 def robot_prefix(name: str) -> str:
-    """Return a robot's name as a prefix of names in ROS and RAPID: letters, digits, underscores."""
+    """Return a robot's name in a form that is valid as a prefix in ROS and RAPID: letters, digits,
+    underscores."""
     plain = "".join(c if c.isascii() and c.isalnum() else "_" for c in name.lower())
     return f"{'r' if not plain[:1].isalpha() else ''}{plain}_"
 
 
 def comment(text: str) -> str:
-    """Return a text that cannot break out of a comment line in a robot's language."""
+    """Return a text without characters that could end a comment line in a robot's language."""
     return "".join(c if " " <= c <= "~" else "?" for c in text)[:_LONGEST_COMMENT]
 
 
 def prefixes(workcell: Workcell) -> tuple[str, str]:
-    """Return the prefixes of the names of each robot's links and joints.
+    """Return the prefix of the names of each robot's links and joints.
 
     Raises:
-        SettingsError: the drivers' own would give both arms' joints the same names.
+        SettingsError: the prefixes that the drivers state would give joints of both arms the same
+            names.
     """
     if one_machine(workcell.robots):
         return "", ""
@@ -200,11 +204,11 @@ def prefixes(workcell: Workcell) -> tuple[str, str]:
 
 
 def ros_joints(workcell: Workcell) -> dict[str, int]:
-    """Return the names in ROS of all joints that the arms move, each once, and its index among both
-    arms' stacked joints: a joint that moves both arms of a machine is the first arm's.
+    """Return the index of each joint among both arms' stacked joints, by its name in ROS. A joint
+    that moves both arms of a machine counts to the first arm.
 
     Raises:
-        SettingsError: see `prefixes`.
+        SettingsError: joints of both arms would have the same names.
     """
     both = zip(workcell.robots, prefixes(workcell), strict=True)
     names = [f"{prefix}{name}" for robot, prefix in both for name in _moving(robot)]
@@ -212,15 +216,15 @@ def ros_joints(workcell: Workcell) -> dict[str, int]:
 
 
 def pad_frame(prefix: str, arm: int) -> str:
-    """Return the name of a pad's frame."""
+    """Return the name of the frame of an arm's pad."""
     return f"{prefix or f'arm_{arm + 1}_'}{PAD}"
 
 
 def description(workcell: Workcell, q: Array) -> str:
-    """Write the cell's URDF.
+    """Return the URDF of the cell with both arms.
 
     Args:
-        q: (joints,) where the simulator's joints begin, both arms side by side [rad].
+        q: (joints,) initial joint positions in a simulator, both arms side by side [rad].
     """
     root = ElementTree.Element("robot", {"name": "cell"})
     ElementTree.SubElement(root, "link", {"name": WORLD})
@@ -273,7 +277,7 @@ def _add_robot(root: ElementTree.Element, robot: Robot, prefix: str, moving: set
 
 
 def _hold(joint: ElementTree.Element, position: float) -> None:
-    """Make a joint a fixed one at a position [rad or m]."""
+    """Change a joint to a fixed joint at a position [rad or m]."""
     origin, axis = joint.find("origin"), joint.find("axis")
     xyz, rpy = (
         _numbers("0 0 0" if origin is None else origin.get(key, "0 0 0")) for key in ("xyz", "rpy")
@@ -293,7 +297,7 @@ def _hold(joint: ElementTree.Element, position: float) -> None:
 
 
 def _add_fixed(root: ElementTree.Element, parent: str, name: str, bodies: Sequence[Body]) -> None:
-    """Add bodies at their poses on a link, as a link of their own."""
+    """Add bodies, at their poses on a link, as a separate link that is fixed to it."""
     _joint(root, f"{name}_fixed", parent, name, np.eye(4))
     link = ElementTree.SubElement(root, "link", {"name": name})
     for body in bodies:
@@ -301,8 +305,8 @@ def _add_fixed(root: ElementTree.Element, parent: str, name: str, bodies: Sequen
 
 
 def _shapes(link: ElementTree.Element, shape: Shape | Capsule | UrdfMesh, pose: Array) -> None:
-    """Add a shape as visual and as collision geometry. URDF has no capsules: their cylinder and
-    spheres are added."""
+    """Add a shape as visual and as collision geometry. Capsules, which URDF lacks, become a
+    cylinder and two spheres."""
     if isinstance(shape, Capsule):
         _shapes(link, Cylinder(shape.radius, shape.length), pose)
         for side in (-0.5, 0.5):

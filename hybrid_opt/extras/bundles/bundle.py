@@ -1,6 +1,6 @@
 """A bundle: the manifest that describes it, its README, and how it is written.
 
-A bundle has a folder of its own and is written whole or not at all; no other file is touched.
+A bundle has its own folder, which is written completely or not at all. No other file is touched.
 """
 
 from __future__ import annotations
@@ -57,16 +57,16 @@ DIGEST_LENGTH = 8
 
 @dataclass(frozen=True)
 class Origin:
-    """Origin of a carry.
+    """Origin of a carry: the study and the point of its front.
 
     Attributes:
         study: name of the study or, without one, of the workcell.
-        algorithm: name of the search, with '-polished' where its front was polished.
-        replica: number of the replica; None where there is none.
-        point: row of the candidate among the evaluations, or another number of the point.
-        file: the trajectory file, '' where there is none.
-        sha256: digest of that file.
-        provenance: as stored in it.
+        algorithm: name of the search, with '-polished' if the front was polished.
+        replica: number of the replica; None if there is none.
+        point: index of the candidate among the evaluations, or another number of the point.
+        file: path of the trajectory file, '' if there is none.
+        sha256: SHA-256 of the trajectory file.
+        provenance: provenance stored in the trajectory file.
     """
 
     study: str = ""
@@ -83,9 +83,9 @@ class Origin:
         content.
 
         Args:
-            path: RESULTS/selected/ALGORITHM/REPLICA.json, or any other.
-            content: of the file.
-            provenance: as stored in it.
+            path: path of the file, such as RESULTS/selected/ALGORITHM/REPLICA.json.
+            content: content of the file.
+            provenance: provenance stored in the file.
         """
         path = path.resolve()
         selected = len(path.parts) > 4 and path.parts[-3] == "selected"
@@ -136,11 +136,16 @@ SET_DOWN = (
 def manifest(
     export: Export, name: str, target: Target, origin: Origin, skew: float | None
 ) -> dict[str, Any]:
-    """Write the manifest of a target's bundle as JSON values: content, origin of the trajectory,
+    """Return the manifest of a target's bundle as JSON values: content, origin of the trajectory,
     and limits.
 
     Args:
-        skew: between the starts of both arms that the job was asked to survive [s].
+        export: the job at the target's time steps.
+        name: name of the target.
+        target: the target.
+        origin: origin of the carry.
+        skew: delay between the starts of both arms that the job has to tolerate [s]; None if not
+            checked.
     """
     job, k = export.job, export.stiffness
     is_lost = bool(target.reaction and export.partner_stop.warning)
@@ -209,7 +214,7 @@ def manifest(
 
 
 def readme(document: Mapping[str, Any], contents: Contents) -> str:
-    """Return the README of a bundle: its content, how to run it, and who stops the robots."""
+    """Return the README of a bundle: its content, how to run it, and what stops the robots."""
     squeeze, machine = document["squeeze"], document["machine"]
     phases = [
         f"| {phase['name'].replace('_', ' ')} | {phase['begin']:.2f} | {phase['duration']:.2f} | "
@@ -255,7 +260,7 @@ def readme(document: Mapping[str, Any], contents: Contents) -> str:
 
 
 def warnings_of(job: Job) -> list[str]:
-    """List warnings that an engineer should read before this job runs."""
+    """Return warnings that an engineer should read before this job runs."""
     cell, found = job.workcell, []
     peak, rated = job.peak_normal_force, cell.task.reference_force
     for robot, force, most in zip(cell.robots, peak, rated, strict=True):
@@ -306,7 +311,7 @@ def _skew(found: Skew) -> dict[str, Any]:
 
 
 def job_digest(job: Job) -> str:
-    """Compute the SHA-256 of everything that decides a job: cell, path, timing, forces."""
+    """Compute the SHA-256 of everything that determines a job: cell, path, timing, forces."""
     digest = hashlib.sha256(job.workcell.digest.encode())
     carry = job.timing.driven
     for values in (carry.x, carry.time, *(phase.force.normal for phase in job.phases)):
@@ -320,7 +325,7 @@ def _number(value: Any) -> int | None:
 
 
 def _word(text: str) -> str:
-    """Return a text as part of a file's name on every system."""
+    """Return a text in a form that is valid in a file's name on every system."""
     kept = "".join(c if c.isascii() and c.isalnum() else "-" for c in text.lower())
     return "-".join(part for part in kept.split("-") if part)[:LONGEST_WORD].strip("-")
 
@@ -336,24 +341,25 @@ def export(
     origin: Origin | None = None,
     options: BundleOptions | None = None,
 ) -> tuple[Path, ...]:
-    """Write a whole job as one bundle, FOLDER/NAME/TARGET, with a manifest.
+    """Write a whole job as a bundle to FOLDER/NAME/TARGET, with a manifest.
 
     Args:
-        job: as `plan_job` makes it, or a timing that robots can drive, for the job around it with
-            default forces.
-        target: name of one of `TARGETS`.
-        folder: parent of the bundle's own folder.
-        origin: where the carry comes from, for the name; by default the workcell's name.
-        options: None for the defaults.
+        job: a job from `plan_job`; or a drivable timing, for which a job with default forces is
+            planned.
+        target: name of a target in `TARGETS`.
+        folder: parent folder of the bundle.
+        origin: origin of the carry, for the name of the bundle; None for the workcell's name.
+        options: options of the bundle; None for the defaults.
 
     Returns:
         The files written, the manifest first.
 
     Raises:
-        SettingsError: the target is unknown, the step out of range or too long for the forces, the
-            timing failed, or the target is not for these arms.
-        JobError: the job cannot be done, a stop or the skew between both arms breaks its squeeze.
-        ResultsError: the bundle cannot be written, or something else is in its place.
+        SettingsError: the target is unknown or not for these arms, the step is out of range or too
+            long for the forces, or the timing failed.
+        JobError: the job cannot be planned, or friction would not hold the box in a stop or with
+            the skew.
+        ResultsError: the bundle cannot be written, or its folder contains something else.
     """
     options, origin = options or BundleOptions(), origin or Origin()
     whole = job if isinstance(job, Job) else plan_job(job)
@@ -377,15 +383,18 @@ def export(
 
 
 def prepared(job: Job, name: str, options: BundleOptions) -> Export:
-    """Return a job sampled at the requested step, or at the longest step that keeps the forces.
+    """Return a job sampled at the requested step, or at the longest step for which the force error
+    stays within the tracking share.
 
     Args:
-        name: of the target, which has the steps.
+        job: the job.
+        name: name of the target, which states the possible steps.
+        options: options of the bundle.
 
     Raises:
-        SettingsError: the step is out of range, none keeps the forces, or the target needs a
-            stiffness that is unknown.
-        JobError: no stop along the path keeps the forces.
+        SettingsError: the step is out of range, no step keeps the force error small enough, or the
+            target needs a stiffness that is unknown.
+        JobError: the commanded forces hold the box in no stop along the path.
     """
     target, step, k = target_for(name, job.workcell), options.step, options.stiffness
     k = target.stiffness_of(job, name) if k is None else k

@@ -1,11 +1,13 @@
-"""Check of any joint trajectory of both arms that claims to carry the box of a cell.
+"""Check of any joint trajectory of both arms that is meant to carry the box of a cell.
 
-The trajectory may be an edited one of a bundle, or another planner's: CSV, JSON or ROS 2's
-JointTrajectory in YAML. The first arm's pad gives the pose of the box; the second arm's pad has to
-hold it there (the closed chain). The cell's contact model gives the forces that the box needs.
+The trajectory may be an edited one of a bundle, or another planner's, as CSV, JSON or ROS 2's
+JointTrajectory in YAML. The first arm's pad gives the pose of the box. The second arm's pad has to
+hold the box at this pose (the closed chain). The cell's contact model gives the forces that the box
+needs.
 
-Controllers interpolate between samples. The interpolated motion is checked as well: chain, limits
-and forces at `BETWEEN` of each step, collisions by a proof along the whole motion.
+Controllers interpolate between samples. The interpolated motion is checked too: closed chain,
+limits and forces at the shares `BETWEEN` of each step, collisions by a proof along the whole
+motion.
 """
 
 from __future__ import annotations
@@ -56,19 +58,19 @@ if TYPE_CHECKING:
     from symbolic.cell_model import CellModel
 
 LARGEST_FILE = 64 * 2**20
-"""[bytes]."""
+"""Largest size of a file [bytes]."""
 
 SHORTEST = 4
-"""Least samples of a trajectory."""
+"""Smallest number of samples of a trajectory."""
 
 TOUCHING = 0.005
-"""Largest change of the pads' places to one another at which they are taken to hold the box [m]."""
+"""The pads count as holding the box while their relative position changes by at most this [m]."""
 
 CLOSED_CHAIN_CHANGE = 1e-3
-"""Largest change at which the closed chain counts as closed [m]."""
+"""The closed chain counts as closed if the pads' relative position changes by at most this [m]."""
 
 EXCESS = 1.005
-"""Use of a limit beyond which it counts as exceeded."""
+"""A limit counts as exceeded if it is used beyond this ratio."""
 
 
 Mask = NDArray[np.bool_]
@@ -76,13 +78,13 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class JointTrajectory:
-    """Both arms' joints over time.
+    """Joints of both arms over time.
 
     Attributes:
         time: (n,) ascending [s].
-        known: (n, joints) each, both arms side by side: positions, and velocities and accelerations
-            where the file has them [rad, m, s].
-        carry: from when to when it carries, where the file says so [s].
+        known: (n, joints) each, both arms side by side: positions, then velocities and
+            accelerations if the file has them [rad, m, s].
+        carry: beginning and end of the carry [s]; None if the file does not state them.
     """
 
     time: Array
@@ -91,26 +93,26 @@ class JointTrajectory:
 
     @property
     def q(self) -> Array:
-        """(n, joints) positions [rad, m]."""
+        """(n, joints) joint positions [rad, m]."""
         return self.known[0]
 
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """Result of checking a trajectory.
+    """Result of the check of a trajectory.
 
     Attributes:
-        held: (n,) whether the pads hold the box there.
-        along, across: largest change of the pads' places to one another while they hold it, along
+        held: (n,) True for samples at which the pads hold the box.
+        along, across: largest change of the pads' relative position while they hold the box, along
             the normal and across it [m].
-        use: largest value over its limit by constraint.
-        collides: what collides first while the box is held, or cannot be proven free; '' for
-            nothing.
+        use: largest value over its limit, by name of the limit.
+        collides: first pair that collides or cannot be proven free while the box is held; '' for
+            none.
         normal_force: (2,) largest normal force that each arm needs [N].
-        rated: (2,) their reference forces [N].
-        balanced: whether friction and patches can hold the box everywhere.
-        duration: of the trajectory [s].
-        interpolation: how it moves between samples.
+        rated: (2,) reference force of each arm [N].
+        balanced: whether friction and patches can hold the box at every sample.
+        duration: duration of the trajectory [s].
+        interpolation: interpolation between samples.
     """
 
     held: Mask
@@ -165,11 +167,11 @@ class Finding:
 
 
 def read_trajectory(path: Path, workcell: Workcell) -> JointTrajectory:
-    """Read the joints of a cell from a file: CSV, JSON (a job's, or ROS 2's message), or YAML of
-    ROS 2.
+    """Read a trajectory of a cell's joints from a file: CSV, JSON (job.json, or a message of ROS
+    2), or YAML of ROS 2.
 
     Raises:
-        ResultsError: it cannot be read, or lacks joints of the cell.
+        ResultsError: the file cannot be read, or lacks joints of the cell.
     """
     content = read_bytes(path)
     if len(content) > LARGEST_FILE:
@@ -194,11 +196,13 @@ def read_trajectory(path: Path, workcell: Workcell) -> JointTrajectory:
 QUANTITIES = ("position", "velocity", "acceleration")
 
 Columns = tuple[Array, dict[tuple[str, str], Array]]
-"""Times (n,); positions, velocities and accelerations (n,) by quantity and the joint's name."""
+"""Columns of a file: times (n,); positions, velocities and accelerations (n,) by quantity and name
+of the joint."""
 
 
 def _csv_columns(text: str) -> tuple[Columns, tuple[float, float] | None]:
-    """Read the columns, and the time span in which a column `phase` says 'carry' [s]."""
+    """Read the columns of a CSV file, and the time span [s] in which the column `phase` is
+    'carry'."""
     rows = list(csv.reader(io.StringIO(text)))
     header, body = rows[0], [row for row in rows[1:] if row]
     words = [re.sub(r"\s*\[.*\]$", "", name).strip() for name in header]
@@ -246,7 +250,7 @@ def _document_columns(document: Any) -> Columns:
 
 
 def _chosen(columns: Columns, workcell: Workcell) -> JointTrajectory:
-    """Select the cell's joints among named columns, under any of their usual names."""
+    """Select the cell's joints from the columns, under any of their usual names."""
     time, values = columns
     names = [
         (f"{robot.name}/{joint}", f"{prefix}{joint}", joint)
@@ -289,13 +293,17 @@ def check(
     """Check a trajectory in a cell.
 
     Args:
-        held: from when to when the pads hold the box [s]; None for the carry that the file names,
-            else for the longest while in which the pads stand to one another as they hold it.
-        interpolation: of the controller between samples; None for the one that takes all
-            that is known at them, as ROS 2's joint trajectory controller does.
+        cell: the cell.
+        trajectory: the trajectory.
+        held: beginning and end of the time in which the pads hold the box [s]; None for the carry
+            that the file states, or else the longest time in which the pads' relative pose can hold
+            the box.
+        interpolation: the controller's interpolation between samples; None for one that uses all
+            known derivatives, as ROS 2's joint trajectory controller does.
 
     Raises:
-        SettingsError: nothing lies in that time, or the file lacks columns of the interpolation.
+        SettingsError: the trajectory has no samples in this time, or the file lacks columns that
+            the interpolation needs.
     """
     workcell, time = cell.workcell, trajectory.time
     held = held or trajectory.carry
@@ -345,14 +353,15 @@ def check(
 
 
 def _places(time: Array) -> Array:
-    """Return samples at times (n,), and at `BETWEEN` of each step."""
+    """Return the times (n,) of the samples, and the times at the shares `BETWEEN` of each step."""
     steps = np.diff(time)
     inside = [time[:-1] + share * steps for share in (0.0, *BETWEEN)]
     return np.append(np.column_stack(inside).ravel(), time[-1])
 
 
 def _load(cell: Cell) -> NumericFunction:
-    """Return `load_function` alone: a timing model brings the compiled passes."""
+    """Return the compiled `load_function` alone. A timing model would also load the compiled
+    passes."""
 
     def make(model: CellModel) -> Mapping[str, ca.Function]:
         from symbolic.contact.load import load_function
@@ -363,8 +372,8 @@ def _load(cell: Cell) -> NumericFunction:
 
 
 def _certificate(cell: Cell, joints: BPoly, time: Array) -> str:
-    """Certify the motion of joints from the first to the last of times (n,): name the first
-    colliding pair; '' if everything is proven free."""
+    """Certify the motion of joints from the first to the last of times (n,). Return the first
+    colliding pair as a text; '' if the motion is proven free."""
     workcell = cell.workcell
 
     def at(places: Array) -> tuple[Array, Array, Array]:
@@ -381,7 +390,7 @@ def _certificate(cell: Cell, joints: BPoly, time: Array) -> str:
 
 
 def _held(along: Array, across: Array) -> Mask:
-    """Return (n,) True on the longest run of samples at which the pads' relative pose holds the
+    """Return (n,) True for the longest run of samples at which the pads' relative pose can hold the
     box."""
     near = (np.abs(along) < TOUCHING) & (across < TOUCHING)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], near.astype(int), [0]])))
@@ -395,7 +404,8 @@ def _held(along: Array, across: Array) -> Mask:
 
 
 def _poses(workcell: Workcell, q: Array) -> Array:
-    """Compute the poses (n, 6) of the box that the first pad holds, in the task's own numbers."""
+    """Compute the box poses (n, 6) that follow from the first arm's pad, in the task's
+    convention."""
     T_pad_box = inverse(workcell.contacts[0].T_box_pad)
     T = pad_places(workcell, 0, joints_of(workcell, q)[0]) @ T_pad_box
     orientation = workcell.task.orientation

@@ -1,6 +1,6 @@
 """The data target: a job as a table (CSV), as JSON with its schema, and as a recording (MCAP).
 
-The recording holds ROS 2's messages, for Foxglove, rviz and rosbag2.
+The recording contains messages of ROS 2, for Foxglove, rviz and rosbag2.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SCHEMA = "job.schema.json"
 def data_files(export: Export) -> dict[str, str | bytes]:
     """Return the table, the JSON file with its schema, and the recording.
 
-    The recording needs the extra `ros`; without it a text names what to install.
+    The recording needs the extra `ros`. Without it a text file states what to install.
     """
     schema = (files("hybrid_opt.extras.bundles") / SCHEMA).read_text("utf-8")
     tables = {"job.csv": job_table(export), "job.json": job_text(export), SCHEMA: schema}
@@ -39,11 +39,12 @@ def data_files(export: Export) -> dict[str, str | bytes]:
 _POSE_UNITS = ("m",) * 3 + ("rad",) * 3
 _WRENCH = ("fx [N]", "fy [N]", "fz [N]", "mx [N m]", "my [N m]", "mz [N m]")
 _JOINT_UNITS = (("rad", "m"), ("rad/s", "m/s"), ("rad/s^2", "m/s^2"), ("N m", "N"), ("N m", "N"))
-"""Units of `Export.joint_columns` of joints that turn and of those that slide."""
+"""Units of `Export.joint_columns`, for joints that turn and for joints that slide."""
 
 
 def job_table(export: Export) -> str:
-    """Write one row per time step, one column per quantity, named with its unit."""
+    """Return the job as a table with one row per time step, and one column per quantity with its
+    unit."""
     job, sampled = export.job, export.sampled
     robots = [robot.name for robot in job.workcell.robots]
     pose = zip(components(job.workcell.task.orientation), _POSE_UNITS, strict=True)
@@ -77,11 +78,12 @@ RECORDED = (
     "std_msgs/msg/String",
     "std_msgs/msg/Bool",
 )
-"""Types of the messages of a recording."""
+"""Message types in a recording."""
 
 
 def recording(export: Export) -> dict[str, str | bytes]:
-    """Return the recording; times count from zero. Without the extra `ros` return a note."""
+    """Return the recording, in which times count from zero. Without the extra `ros` return a note
+    instead."""
     try:
         from mcap.writer import Writer
         from rosbags.typesys import Stores, get_typestore
@@ -108,7 +110,7 @@ def recording(export: Export) -> dict[str, str | bytes]:
 
 
 def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, str, Any]]:
-    """Yield every sample's messages, of these types, with their times [ns] and topics."""
+    """Yield the messages of every sample, each with its time [ns] and topic."""
     sampled, cell, joined = export.sampled, export.workcell, prefixes(export.workcell)
     joints = ros_joints(cell)
     places = list(joints.values())
@@ -119,19 +121,20 @@ def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, s
     boxes = box_placement(cell.task.orientation, sampled.pose)
 
     def of(kind: str, *values: Any) -> Any:
-        """Build a message from its fields in order."""
+        """Build a message from its fields, in order."""
         package, name = kind.split("/")
         return types[f"{package}/msg/{name}"](*values)
 
     def placed(kind: str, T: Array) -> tuple[Any, Any]:
-        """Build the position, as a message of a kind, and the quaternion of a pose (4, 4)."""
+        """Build the position, as a message of the given kind, and the quaternion of a pose T (4,
+        4)."""
         turn = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
         position = of(f"geometry_msgs/{kind}", *T[:3, 3].tolist())
         return position, of("geometry_msgs/Quaternion", *turn)
 
     def frames(k: int) -> Iterator[tuple[str, Array]]:
-        """Yield the box, every link of both arms and both pads with their poses (4, 4) in the
-        world."""
+        """Yield the name and pose (4, 4) in the world of the box, every link of both arms, and both
+        pads at sample k."""
         yield "box", boxes[k]
         for arm, robot in enumerate(cell.robots):
             model, found, prefix = models[arm], data[arm], joined[arm]
@@ -177,8 +180,7 @@ def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, s
 
 
 def pad_wrench(sampled: SampledJob, arm: int) -> Array:
-    """Compute the force and moment (n, 6) that a pad exerts on the box, along the pad's axes [N,
-    N m]."""
+    """Compute the force and moment (n, 6) [N, N m] of a pad on the box, along the pad's axes."""
     T_box_pad = sampled.job.workcell.contacts[arm].T_box_pad
     turned = box_rotation(sampled.job.workcell.task.orientation, sampled.pose)
     R_world_pad = turned @ T_box_pad[:3, :3]

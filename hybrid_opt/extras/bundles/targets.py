@@ -1,4 +1,4 @@
-"""The targets of an export by their names, and the data that a cell lacks for one."""
+"""The targets of an export by name, and the data that a cell lacks for a target."""
 
 from __future__ import annotations
 
@@ -33,30 +33,32 @@ from symbolic.errors import SettingsError
 from symbolic.records import Workcell
 
 SKEW = 0.01
-"""Largest start skew expected of two controllers with clocks of their own [s]."""
+"""Largest expected delay between the starts of two controllers with separate clocks [s]."""
 
 
 @dataclass(frozen=True)
 class Target:
-    """A kind of bundle, by its drivers.
+    """A kind of bundle, for one kind of driver.
 
     Attributes:
-        files: from an export to file contents by path.
-        steps: time steps that it can have, the longest first [s].
-        interpolation: how it moves between two samples.
+        files: function from an export to file contents by path.
+        steps: possible time steps, the longest first [s].
+        interpolation: the driver's interpolation between two samples.
         how_to_run: text for the README.
         reaction: text on who carries out a stop; '' for data that is not run.
         start: text on the common start of both arms.
-        skew: delay between their starts that a job has to tolerate [s]; None if not checked.
-        maker: of the arms, one of those of `hybrid_opt.extras.bundles.arms`; '' for all.
-        axes: numbers of turning joints that a maker's targets can hold.
-        has_address: it needs the addresses of the controllers.
-        require: refuses a job before it is sampled, for further reasons.
-        require_equipment: refuses a cell whose drivers lack something, given the index of the
-            leading arm.
-        lines: how it switches and hears hands that hold by themselves; None if it does not.
-        stiffness: where that of the arms comes from: 'stated' by the cell, required; 'gains' that
-            the bundle writes; '' if the target does not depend on it.
+        skew: delay between the starts of both arms that a job has to tolerate [s]; None if not
+            checked.
+        maker: maker of the arms, one of those in `hybrid_opt.extras.bundles.arms`; '' for all.
+        axes: supported numbers of turning joints.
+        has_address: True if the target needs the addresses of the controllers.
+        require: function that raises an error for a job that the target cannot run, before it is
+            sampled.
+        require_equipment: function of a cell and the index of the leading arm that raises an error
+            if a driver lacks something.
+        lines: names of the outputs and inputs of hands; None if the target does not switch hands.
+        stiffness: source of the arms' stiffness: 'stated' if the cell has to state it, 'gains' if
+            it follows from the gains in the bundle, '' if the target does not depend on it.
     """
 
     files: Callable[[Export], Contents]
@@ -75,13 +77,15 @@ class Target:
     stiffness: str = ""
 
     def refuse(self, job: Job, name: str, any_arm: bool) -> None:
-        """Refuse a job that is not for this target of a name, before it is sampled.
+        """Check, before a job is sampled, that this target can run it.
 
         Args:
-            any_arm: whether the user wants a maker's language for arms of others.
+            job: the job.
+            name: name of the target, for messages.
+            any_arm: True to accept arms that do not look like those of the target's maker.
 
         Raises:
-            SettingsError: the arms are not those that the target is for, or lack what it needs.
+            SettingsError: the arms are not of the target's maker, or lack something that it needs.
         """
         self.require_hands(job.workcell, name)
         if self.maker:
@@ -91,10 +95,11 @@ class Target:
         self.require(job)
 
     def require_hands(self, workcell: Workcell, name: str) -> None:
-        """Refuse hands that hold by themselves if the target of a name does not reach them.
+        """Check that the target with this name can switch the hands of a cell.
 
         Raises:
-            SettingsError: it switches none, or not by the names of the drivers.
+            SettingsError: the target switches no hands, or the names of their outputs are not valid
+                for it.
         """
         if contact_model(workcell).is_squeeze:
             return
@@ -104,9 +109,11 @@ class Target:
             self.lines.require(workcell, name)
 
     def stiffness_of(self, job: Job, name: str) -> float | None:
-        """Return the stiffness of each arm at its pad [N/m]; None if nothing depends on it.
+        """Return the stiffness of each arm at its pad [N/m]; None if the target does not depend on
+        it.
 
-        Both arms hold the box in series: of k_1 and k_2 it is 2 / (1 / k_1 + 1 / k_2).
+        Both arms hold the box like springs in series, so k_1 and k_2 are averaged to 2 / (1 / k_1 +
+        1 / k_2).
 
         Raises:
             SettingsError: the target depends on an unknown stiffness.
@@ -116,7 +123,8 @@ class Target:
         return self.stated_stiffness(job.workcell, name)
 
     def stated_stiffness(self, workcell: Workcell, name: str) -> float | None:
-        """Return the stiffness that a cell states; None if nothing depends on it.
+        """Return the stiffness of each arm at its pad that a cell states [N/m]; None if the target
+        does not depend on it.
 
         Raises:
             SettingsError: the target depends on an unknown stiffness.
@@ -140,7 +148,8 @@ RUN = "run_job.py looks at both arms a hundred times a second and replaces their
 
 
 CYCLE_SKEW = 0.002
-"""Largest skew of two drivers with the same start time in their goals: one cycle [s]."""
+"""Largest delay between the starts of two drivers with the same start time in their goals, one
+cycle [s]."""
 
 
 _TORQUE = Target(
@@ -184,7 +193,7 @@ TORQUE_DRIVERS: Mapping[str, Target] = {
         "box, then python3 run_job.py",
     ),
 }
-"""The torque target by its drivers."""
+"""The torque target of each driver, by the driver's name."""
 
 
 TARGETS: Mapping[str, Target] = {
@@ -235,7 +244,7 @@ TARGETS: Mapping[str, Target] = {
         lines=Lines(".*", ".*", ""),
     ),
 }
-"""Every target by its name; `TORQUE_DRIVERS` has the drivers of torque."""
+"""Every target by its name; `TORQUE_DRIVERS` has the variants of the torque target."""
 
 
 GONE = {
@@ -247,11 +256,15 @@ GONE = {
     "json": "data",
     "mcap": "data",
 }
-"""Targets of earlier versions, and their replacements."""
+"""Names of targets of earlier versions, with their replacements."""
 
 
 def require_target(name: str) -> None:
-    """Refuse an unknown target, and one that is no longer written."""
+    """Check that a target exists.
+
+    Raises:
+        SettingsError: the name is unknown, or the target is no longer written.
+    """
     if name in GONE:
         raise SettingsError(f"target {name!r} is no longer written; use {GONE[name]}")
     if name not in TARGETS:
@@ -261,7 +274,7 @@ def require_target(name: str) -> None:
 
 
 def target_for(name: str, workcell: Workcell) -> Target:
-    """Return the target of a name, with the driver that the cell's arms have.
+    """Return the target with this name, in the variant for the drivers of the cell's arms.
 
     Raises:
         SettingsError: the name is unknown, or no driver takes torques for these arms.
@@ -271,10 +284,11 @@ def target_for(name: str, workcell: Workcell) -> Target:
 
 
 def missing_for(name: str, workcell: Workcell, leader: int = 0) -> tuple[str, ...]:
-    """List the data that a cell lacks for a target, before any carry is known.
+    """Return the data that a cell lacks for a target, as sentences, before any carry is known.
 
     Args:
-        name: of the target.
+        name: name of the target.
+        workcell: the cell.
         leader: index of the arm that keeps its place.
 
     Raises:
@@ -303,7 +317,7 @@ def missing_for(name: str, workcell: Workcell, leader: int = 0) -> tuple[str, ..
 
 
 def missing_loads(workcell: Workcell) -> list[str]:
-    """List the robots whose tool loads are not given, as warnings."""
+    """Return a warning for each robot whose tool load is not stated."""
     return [
         f"no tool_load is given for {robot.name}: torques and tool data leave out the pad's mass"
         for robot in workcell.robots
@@ -312,7 +326,7 @@ def missing_loads(workcell: Workcell) -> list[str]:
 
 
 def missing_text(name: str, workcell: Workcell) -> str:
-    """List the data that a cell lacks for a target, for a terminal.
+    """Format the data that a cell lacks for a target, for a terminal.
 
     Raises:
         SettingsError: the target is unknown.
@@ -328,5 +342,5 @@ def missing_text(name: str, workcell: Workcell) -> str:
 
 
 def targets() -> dict[str, str]:
-    """Return the targets of `export`: how to run each, by name."""
+    """Return for each target of `export` a text on how to run it, by name."""
     return {name: target.how_to_run for name, target in TARGETS.items()}

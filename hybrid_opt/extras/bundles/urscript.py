@@ -1,17 +1,18 @@
 """The draft for Universal Robots without ROS: one URScript program per arm.
 
-Functions are those of Universal Robots' script manual: servoj, force_mode, force_mode_set_damping,
-force_mode_set_gain_scaling, end_force_mode, zero_ftsensor, set_tcp, set_target_payload, force,
-get_actual_joint_positions, set_standard_digital_out, threads. Each point of the path is one call of
-`go`. Where the job has to stop, `go` stretches the time of the points until the arm stands: on the
-path, under force. `programs/carry.script` has all but the numbers of a job.
+The programs use functions of Universal Robots' script manual: servoj, force_mode,
+force_mode_set_damping, force_mode_set_gain_scaling, end_force_mode, zero_ftsensor, set_tcp,
+set_target_payload, force, get_actual_joint_positions, set_standard_digital_out, threads. Each point
+of the path is one call of `go`. If the job has to stop, `go` stretches the time of the points until
+the arm is at rest, on the path and under force. `programs/carry.script` contains everything except
+the numbers of a job.
 
 Force mode does not execute motion along its compliant axis (ur_robot_driver main,
-doc/usage/force_torque_control.rst): along the normals the pressing arm follows the other one by the
-error of its force alone. Hands that hold by themselves are switched and heard over standard
-digital lines (set_standard_digital_out, get_standard_digital_in); neither arm is under force then.
-set_target_payload zeroes the force sensor (script manual): the programs
-state the tool's load once, before the first contact, and the box is never part of it.
+doc/usage/force_torque_control.rst): along the normals the pressing arm follows the other arm only
+by the error of its force. Gripping hands are switched and read over standard digital lines
+(set_standard_digital_out, get_standard_digital_in); neither arm is force controlled then.
+set_target_payload zeroes the force sensor (script manual): the programs state the tool's load once,
+before the first contact, and the box is never part of it.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from symbolic.errors import SettingsError
 from symbolic.records.poses import box_rotation
 
 CYCLE = 0.002
-"""Cycle of an e-series controller [s]."""
+"""Cycle time of an e-series controller [s]."""
 
 MAX_POINTS = 20_000
 
@@ -41,15 +42,15 @@ FORCE_EVERY = 0.04
 """Time between two force references [s]."""
 
 FOLLOWED = 0.05
-"""Largest speed along its normal with which force mode may move the pressing pad [m/s]; the limit
-that the program gives to force_mode."""
+"""Largest speed along its normal with which force mode may move the pressing pad [m/s]. The program
+gives this limit to force_mode."""
 
 
 def require_followed(job: Job) -> None:
-    """Refuse a carry that moves along its normals faster than force mode may follow.
+    """Check that a carry moves along its normals no faster than force mode may follow.
 
     Raises:
-        SettingsError: with the speed, and what would do.
+        SettingsError: the carry is too fast; the message states the speed and remedies.
     """
     if job.follower is None:
         return
@@ -69,7 +70,7 @@ def require_followed(job: Job) -> None:
 
 
 def normal_speed(job: Job, arm: int) -> float:
-    """Return the largest speed of an arm's pad along its normal while it holds the box [m/s]."""
+    """Return the largest speed of an arm's pad along its normal while the box is held [m/s]."""
     contact, orientation = job.workcell.contacts[arm], job.workcell.task.orientation
     fastest = 0.0
     for phase in job.held:
@@ -84,10 +85,10 @@ def normal_speed(job: Job, arm: int) -> float:
 
 
 def urscript_files(export: Export) -> dict[str, str | bytes]:
-    """Write the programs of both arms.
+    """Return the programs of both arms, by path.
 
     Raises:
-        SettingsError: the time step is no multiple of the controller's cycle that fills every
+        SettingsError: the time step is not a multiple of the controller's cycle that fills every
             phase.
     """
     steps = np.diff(export.sampled.time)
@@ -174,13 +175,13 @@ def _phase(export: Export, arm: int, index: int, name: str) -> Iterator[str]:
 
 
 def _payload(export: Export, arm: int) -> str:
-    """Return arguments of set_target_payload: mass [kg], centre in the flange's frame [m]."""
+    """Return the arguments of set_target_payload: mass [kg], and centre in the flange frame [m]."""
     mass, centre = export.tool_load(arm)
     return f"{mass:.4f}, {_list(centre)}"
 
 
 def _pose(T: Array) -> str:
-    """Write a URScript pose: position [m] and rotation vector [rad]."""
+    """Return a pose in URScript: position [m] and rotation vector [rad]."""
     turn = Rotation.from_matrix(T[:3, :3]).as_rotvec()
     return f"p{_list(np.concatenate([T[:3, 3], turn]))}"
 

@@ -1,7 +1,8 @@
 """A whole cell in MuJoCo: both arms under their controllers, the box between their pads.
 
 Only joint torques, gravity and contacts move anything. `simulate_carry` finds the least multiple of
-the planned forces that holds a carry, and simulates it with the commanded ones.
+the planned forces that holds the box during a carry, and simulates the carry with the commanded
+forces.
 """
 
 from __future__ import annotations
@@ -50,26 +51,27 @@ from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation
 
 LOOK_INTERVAL = 5e-3
-"""Time between two looks at the box [s]."""
+"""Time between two measurements of the box [s]."""
 
 LOW, HIGH, BISECTIONS = 0.9, 2.0, 9
-"""Factors between which a threshold is looked for, to about 0.2 %."""
+"""Factors between which a threshold is searched by so many bisections, to about 0.2 %."""
 
 
 @dataclass(frozen=True)
 class ArmOutcome(Outcome):
-    """Outcome of one simulation of a whole cell, at n moments; the slip only while it is held.
+    """Outcome of one simulation of a whole cell at n times. Slip is measured only while the box is
+    held.
 
     Attributes:
         normal_force: (n, 2) measured normal force of each arm [N].
         normal_force_reference: (n, 2) commanded normal force of each arm [N].
         q: (n, all joints) joint positions of both arms [rad].
-        tracking_error: (n, all joints) reference less position [rad].
-        torque_use: (all joints,) largest torque of each joint over its largest allowed.
-        box_position: (n, 3) of the box frame [m].
+        tracking_error: (n, all joints) reference minus position [rad].
+        torque_use: (all joints,) largest torque of each joint over its limit.
+        box_position: (n, 3) position of the box frame in the world [m].
         box_rotation: (n, 3, 3) R_world_box.
-        misses: distance of the box from its goal at the end [m]; zero where there is none.
-        arrives: whether it held and the box ended at its goal.
+        misses: distance of the box from its goal at the end [m]; zero if there is no goal.
+        arrives: True if the box did not slip and ended at its goal.
     """
 
     normal_force: Array
@@ -84,11 +86,11 @@ class ArmOutcome(Outcome):
 
 
 class PressedBox(HeldBox):
-    """A box whose pads' normal forces are measured, and whose contacts' acceleration is
+    """A box with measured normal forces of the pads, and with contacts whose acceleration is
     corrected."""
 
     def __init__(self, mujoco: ModuleType, model: Any, data: Any, workcell: Workcell) -> None:
-        """Find the pads' contact points as well."""
+        """Find the contact points of the pads too."""
         super().__init__(model, data, workcell)
         self._mujoco, self._model = mujoco, model
         self._bodies = [int(model.site_bodyid[site]) for site in self.sites]
@@ -103,19 +105,19 @@ class PressedBox(HeldBox):
 
     @property
     def normal_forces(self) -> Array:
-        """(2,) sum of the normal forces at each pad's points in the last step [N]."""
+        """(2,) sum of the normal forces at the contact points of each pad in the last step [N]."""
         pad, _, address, _ = self._contacts()
         return np.bincount(pad, self._data.efc_force[address], 2).astype(float)
 
     def mend_contacts(self) -> None:
         """Correct the contacts of this step for all accelerations.
 
-        MuJoCo takes J dv/dt for the acceleration of the box over a pad, which has dJ/dt v besides:
-        some tenths of m/s^2 where arms swing. Contacts that do not know it creep by millimetres
-        per second and lift off. Call it between the two halves of a step.
+        MuJoCo takes J dv/dt as the acceleration of the box relative to a pad and neglects dJ/dt v,
+        some tenths of m/s^2 where arms swing. Without this term contacts creep by millimetres per
+        second and lift off. Call this method between the two halves of a step.
 
-        A step takes joints along arcs and the box along a line, which parts them by half of
-        dJ/dt v dt^2. The contacts' damping is set to make up for it.
+        A step moves joints along arcs and the box along a line, which separates them by half of
+        dJ/dt v dt^2. The contacts' damping is set to compensate for it.
         """
         pad, is_first, address, axes = self._contacts()
         if not len(pad):
@@ -126,7 +128,7 @@ class PressedBox(HeldBox):
         self._data.efc_aref[rows] -= sign * np.einsum("nij,nj->ni", axes, unseen)
 
     def _unseen(self, pad: int) -> Array:
-        """Compute (3,) dJ/dt v of a pad less that of the box beneath it, world axes [m/s^2]."""
+        """Compute dJ/dt v (3,) of a pad minus that of the box beneath it, world axes [m/s^2]."""
         place, found = self._data.site_xpos[self.sites[pad]], []
         for body in (self._bodies[pad], self.box):
             self._mujoco.mj_jacDot(self._model, self._data, self._change, None, place, body)
@@ -135,8 +137,9 @@ class PressedBox(HeldBox):
         return less
 
     def _contacts(self) -> tuple[Indices, NDArray[np.bool_], Indices, Array]:
-        """Return the pads' active contacts: the pad (n,), whether it is the first body (n,), the
-        first of three rows among the constraints (n,), the contact's axes as rows (n, 3, 3)."""
+        """Return the active contacts of the pads: index of the pad (n,); True if the pad is the
+        first body (n,); first of three rows among the constraints (n,); axes of the contact as rows
+        (n, 3, 3)."""
         contact = self._data.contact
         sides = self._pad_of_geom[contact.geom]
         pad = sides.max(axis=1)
@@ -146,12 +149,12 @@ class PressedBox(HeldBox):
 
 
 class CellSimulation:
-    """A simulated workcell with its arms.
+    """Simulation of a whole workcell with both arms.
 
     Attributes:
         workcell, settings: the cell, and settings of the simulation.
-        mujoco, model, text: the simulator, its model, and this as MJCF.
-        disturbance: (3,) [m/s^2].
+        mujoco, model, text: the simulator's module, its model of the cell, and the model as MJCF.
+        disturbance: (3,) additional acceleration of the box, world frame [m/s^2].
     """
 
     def __init__(
@@ -160,11 +163,13 @@ class CellSimulation:
         settings: ArmSettings | None = None,
         disturbance: ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
-        """Describe the cell; nothing is simulated yet.
+        """Build the model of the cell. Nothing is simulated yet.
 
         Args:
-            disturbance: (3,) acceleration that the pads have to give the box beside the motion's,
-                world frame [m/s^2].
+            workcell: the cell.
+            settings: settings of the simulation; None for the defaults.
+            disturbance: (3,) acceleration that the pads have to give the box in addition to the
+                motion's, world frame [m/s^2].
 
         Raises:
             SimulationError: MuJoCo is not installed, or torques are unknown.
@@ -191,15 +196,16 @@ class CellSimulation:
         """Simulate one job, up to its end or to a slip.
 
         Args:
-            reference: the cell's commands; its workcell may differ from the simulated one in
-                payload, friction and the pads' places.
-            factor: multiple of the normal forces to press with.
+            reference: commands of the cell. Its workcell may differ from the simulated one in
+                payload, friction and the positions of the pads.
+            control: kind of force control.
+            factor: multiple of the commanded normal forces.
         """
         return _ArmSimulation(self, reference, control, factor).outcome()
 
 
 class _ArmSimulation:
-    """One simulation."""
+    """The state of one simulation of a cell."""
 
     def __init__(
         self,
@@ -293,7 +299,7 @@ class _ArmSimulation:
         )
 
     def _place(self, disturbance: Array) -> Array:
-        """Set arms and box to their first poses; return the box's (7,) in MuJoCo's form."""
+        """Set arms and box to their first poses. Return the box's pose (7,) in MuJoCo's form."""
         data, job = self._data, self._reference.job
         data.qpos[self._q], data.qvel[self._v] = self._ticks.q[0], self._ticks.q_rate[0]
         rotation = box_rotation(self._workcell.task.orientation, job.start)
@@ -309,7 +315,7 @@ class _ArmSimulation:
         return standing
 
     def _begin_step(self, time: float) -> None:
-        """Make the first half of a step: poses and contacts of this moment."""
+        """Make the first half of a step: compute poses and contacts at this time."""
         if time < self._reference.job.stands:
             self._data.qpos[self._pose] = self._standing
             self._data.qvel[self._box_v] = 0.0
@@ -317,7 +323,7 @@ class _ArmSimulation:
         self._pads.mend_contacts()
 
     def _torque(self, k: int, measured: Array) -> Array:
-        """Compute the torques (all joints,) at tick k, clipped to the joints' limits."""
+        """Compute the torques (all joints,) [N m] at tick k, clipped to the joint limits."""
         data, ticks = self._data, self._ticks
         error = ticks.q[k] - data.qpos[self._q]
         error_rate = ticks.q_rate[k] - data.qvel[self._v]
@@ -342,7 +348,7 @@ class _ArmSimulation:
         return np.clip(torque, -self._limit, self._limit)
 
     def _joint_inertia(self) -> Array:
-        """Compute the inertia (all joints,) about each joint while the others stand still [kg
+        """Compute the inertia (all joints,) about each joint while the other joints are fixed [kg
         m^2]."""
         found = np.empty(len(self._v))
         for k, joint in enumerate(self._v):
@@ -355,7 +361,8 @@ class _ArmSimulation:
 
 @dataclass(frozen=True, eq=False)
 class _Ticks:
-    """References at the controllers' ticks: as in `Reference`, pressing times the factor."""
+    """References at the controllers' ticks, as in `Reference`, with the pressing forces times the
+    factor."""
 
     time: Array
     q: Array
@@ -395,12 +402,12 @@ class CarrySimulation:
     """Simulations of one carry.
 
     Attributes:
-        threshold: the least multiple of the planned forces that holds; None if there is none
-            between `LOW` and `HIGH`.
-        problem: reason why there is none, else ''.
-        reference: the cell's commands in the shown simulation.
-        squeeze: origin of its forces.
-        shown: outcome of that simulation.
+        threshold: the least multiple of the planned forces that holds the box; None if there is
+            none between `LOW` and `HIGH`.
+        problem: reason why there is no threshold, else ''.
+        reference: commands of the cell in the simulation with the commanded forces.
+        squeeze: how the commanded forces came about.
+        shown: outcome of the simulation with the commanded forces.
     """
 
     threshold: Threshold[ArmOutcome] | None
@@ -413,11 +420,13 @@ class CarrySimulation:
 def simulate_carry(
     cell: Cell, carry: Carry, witness: CellSimulation, control: Control = "leader", leader: int = 0
 ) -> CarrySimulation:
-    """Simulate a carry at its threshold, and with the commanded forces.
+    """Find the threshold of a carry, and simulate it with the commanded forces.
 
     Args:
-        carry: from rest to rest.
-        witness: of the cell.
+        cell: the cell.
+        carry: carry from rest to rest.
+        witness: simulation of the cell.
+        control: kind of force control.
         leader: index of the arm that keeps its place.
 
     Raises:

@@ -1,8 +1,9 @@
-"""A driven box in MuJoCo: pressed with a multiple of a force, does it stay in place?
+"""A driven box in MuJoCo, to find whether it stays in place when pressed with a multiple of a
+force.
 
-The carriage is set to the planned state of the box frame at every step and accelerated as planned
-within it, so that the pads move exactly as planned, as on stiff arms; the box, free, is held by
-friction alone. `Outcome`, `Threshold` and `HeldBox` are those of whole cells, too.
+The carriage is set to the planned state of the box frame at every step, and accelerated as planned
+within the step. So the pads move exactly as planned, as on stiff arms; the box is free, and only
+friction holds it. `Outcome`, `Threshold` and `HeldBox` serve simulations of whole cells too.
 """
 
 from __future__ import annotations
@@ -38,28 +39,28 @@ from symbolic.records import Contact, Workcell
 from symbolic.records.poses import box_rotation
 
 BEGINS = 0.05
-"""Share of the slip that counts as one at which it is said to begin."""
+"""Slip counts as begun at this share of the slip that counts as slipped."""
 
 SAME_TIME = 1e-9
-"""Samples closer than this are both sides of one instant [s]."""
+"""Samples that are closer in time than this are both sides of a jump [s]."""
 
 SLIP_INTERVAL = 2e-3
-"""Time between two looks at the slip [s]."""
+"""Time between two measurements of the slip [s]."""
 
 RIM_POINTS = 8
-"""Places on the rim of each robot's first patch where the slip is measured."""
+"""Number of points on the rim of each robot's first patch at which the slip is measured."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of one simulation, at n moments.
+    """Outcome of one simulation at n times.
 
     Attributes:
         factor: multiple of the pressing force.
-        holds: whether the box slipped by less than the settings' slip.
-        time: (n,) when it was looked at, from the settled state on [s].
-        slip: (n, 2) largest displacement in the plane of each pad since then [m].
-        turn: (n,) angle by which the box turned between its pads since then [rad].
+        holds: True if the box slipped by less than the slip in the settings.
+        time: (n,) times of the measurements, from the settled state on [s].
+        slip: (n, 2) largest displacement in the plane of each pad since the settled state [m].
+        turn: (n,) rotation of the box between its pads since the settled state [rad].
     """
 
     factor: float
@@ -74,8 +75,8 @@ class Outcome:
         return int(self.slip[-1].argmax())
 
     def begins(self, slip: float) -> float:
-        """Return the time at which the slip first exceeds `BEGINS` times `slip` [s]; infinite if
-        never."""
+        """Return the time [s] at which the slip first exceeds `BEGINS` times `slip` [m]; infinite
+        if it never does."""
         beyond = np.flatnonzero(self.slip.max(axis=1) > BEGINS * slip)
         return float(self.time[beyond[0]]) if len(beyond) else float("inf")
 
@@ -85,10 +86,10 @@ AnyOutcome = TypeVar("AnyOutcome", bound=Outcome)
 
 @dataclass(frozen=True)
 class Threshold(Generic[AnyOutcome]):
-    """The least multiple of a force that holds.
+    """The least multiple of a force that holds the box, between two simulations.
 
     Attributes:
-        slips, holds: simulations right below and above it.
+        slips, holds: outcome of the simulation just below and just above it.
     """
 
     slips: AnyOutcome
@@ -96,14 +97,14 @@ class Threshold(Generic[AnyOutcome]):
 
     @property
     def factor(self) -> float:
-        """Middle of both multiples."""
+        """Mean of both multiples."""
         return (self.slips.factor + self.holds.factor) / 2.0
 
 
 def bisected(
     simulate: Callable[[float], AnyOutcome], low: float, high: float, steps: int
 ) -> Threshold[AnyOutcome]:
-    """Find the least factor with which a simulation holds, by bisection.
+    """Find the least factor with which the box holds in a simulation, by bisection.
 
     Args:
         simulate: function of a factor that returns its outcome.
@@ -127,7 +128,7 @@ def mujoco_module() -> ModuleType:
     """Import the simulator.
 
     Raises:
-        SimulationError: it is not installed.
+        SimulationError: MuJoCo is not installed.
     """
     try:
         import mujoco
@@ -140,11 +141,12 @@ def mujoco_module() -> ModuleType:
 
 
 class HeldBox:
-    """Pose of the box between its pads in one simulation, at the beginning of its last step.
+    """Measurement of the box's pose between its pads in one simulation, at the beginning of the
+    last step.
 
     Attributes:
-        sites: of the two pads.
-        box: the body.
+        sites: indices of the sites of both pads.
+        box: index of the body of the box.
     """
 
     def __init__(self, model: Any, data: Any, workcell: Workcell) -> None:
@@ -157,7 +159,7 @@ class HeldBox:
         self._settled: tuple[Array, Array] | None = None
 
     def look(self) -> tuple[Array, float]:
-        """Measure the displacement of the box over the patches' rims in the planes of the pads (2,)
+        """Measure the displacement of the box at the patches' rims in the planes of the pads (2,)
         [m], and its rotation between them [rad], since the first call."""
         axes = self._data.site_xmat[self.sites].reshape(2, 3, 3)
         places = self._data.site_xpos[self.sites][:, None]
@@ -175,12 +177,14 @@ class HeldBox:
 
 @dataclass(frozen=True)
 class CarriageMotion:
-    """The carriage's motion at n time steps.
+    """Motion of the carriage at n time steps.
 
     Attributes:
-        time: (n,) from minus the time to settle to the end of the carry [s].
-        pose: (n, 7) of the box frame: place in the world [m], unit quaternion, real part first.
-        velocity, acceleration: (n, 6) linear in the world, angular in the box frame [m, rad, s].
+        time: (n,) from minus the settling time to the end of the carry [s].
+        pose: (n, 7) pose of the box frame: position in the world [m], unit quaternion with the real
+            part first.
+        velocity, acceleration: (n, 6) linear in the world frame, angular in the box frame [m, rad,
+            s].
         rotation: (n, 3, 3) R_world_box.
     """
 
@@ -191,27 +195,28 @@ class CarriageMotion:
     rotation: Array
 
     def acceleration_at(self, place: Array) -> Array:
-        """Compute the acceleration (n, 3) of a place in the box frame, along its axes [m/s^2]."""
+        """Compute the acceleration (n, 3) of a point (3,) that is fixed in the box frame, along its
+        axes [m/s^2]."""
         spin, spin_rate = self.velocity[:, 3:], self.acceleration[:, 3:]
         linear = np.einsum("nji,nj->ni", self.rotation, self.acceleration[:, :3])
         turned: Array = linear + np.cross(spin_rate, place)
         return turned + np.cross(spin, np.cross(spin, place))
 
     def apply(self, data: Any, k: int) -> None:
-        """Set the carriage of a simulation, its first body, to step k."""
+        """Set the carriage of a simulation, the first body, to the state of step k."""
         data.qpos[:7], data.qvel[:6] = self.pose[k], self.velocity[k]
         data.qfrc_applied[:6] = CARRIAGE_MASS * self.acceleration[k]
 
 
 @dataclass(frozen=True)
 class Drive:
-    """The carriage's motion and the pressing force at n time steps.
+    """Motion of the carriage and pressing force at n time steps.
 
     Attributes:
         leader: index of the pad that keeps its place on the carriage.
-        motion: of the carriage.
+        motion: motion of the carriage.
         press: (n,) normal force of the other pad [N].
-        own: (n,) force that the sliding pad's own mass takes along its normal [N].
+        own: (n,) force along its normal that accelerates the sliding pad's mass [N].
         tilt: (n, 2, 2) planned moments of both pads about the x and y axes of their frames [N m].
     """
 
@@ -223,9 +228,9 @@ class Drive:
 
 
 def planned_moments(cell: Cell, carry: Carry) -> Array:
-    """Compute the moments (n + 1, 2, 3) of each robot's planned wrenches about the middle of its
-    pads, for the carry's own friction and centre of mass [N m], world frame: at rest before it,
-    then at its samples."""
+    """Compute the moments (n + 1, 2, 3) [N m] of each robot's planned wrench about the middle of
+    its pads, world frame: first at rest before the carry, then at the samples of the carry.
+    Friction and centre of mass are those of the carry."""
     workcell = carry.workcell
     still = np.zeros_like(carry.rate[:1])
     known = replace(
@@ -252,16 +257,19 @@ def drive_of(
     leader: int = 0,
     moments: Array | None = None,
 ) -> Drive:
-    """Compute the motion of a carry from rest to rest, with the box at rest before it.
+    """Compute the motion and the pressing force of a carry from rest to rest, with the box at rest
+    before it.
 
     Args:
-        press: (n,) force to press with at the carry's samples; the planned normal force of the
-            arm that does not lead by default [N].
+        carry: the carry at n samples.
+        settings: settings of the simulation.
+        press: (n,) pressing force at the samples [N]; None for the planned normal force of the arm
+            that does not lead.
         leader: index of the arm that keeps its place.
-        moments: what turns driven pads, see `planned_moments`; none by default.
+        moments: result of `planned_moments`, which turns driven pads; None for no moments.
 
     Raises:
-        SettingsError: the carry does not start and end at rest, or the force does not fit it.
+        SettingsError: the carry does not start and end at rest, or `press` has another shape.
     """
     force = carry.normal_force[:, 1 - leader] if press is None else press
     if force.shape != carry.time.shape:
@@ -320,7 +328,7 @@ def carriage_motion(carry: Carry, settings: SimulationSettings) -> CarriageMotio
 
 
 def refuse_motion_at_ends(carry: Carry) -> None:
-    """Refuse a carry that no simulation can begin with.
+    """Check that a carry starts and ends at rest, as simulations need.
 
     Raises:
         SettingsError: the carry does not start and end at rest.
@@ -332,7 +340,7 @@ def refuse_motion_at_ends(carry: Carry) -> None:
 
 
 class BoxSimulation:
-    """The box of one workcell between its pads.
+    """Simulation of one workcell's box between its pads.
 
     Attributes:
         workcell, settings: the cell, and settings of the simulation.
@@ -344,14 +352,17 @@ class BoxSimulation:
         settings: SimulationSettings | None = None,
         disturbance: ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
-        """Describe the scene; nothing is simulated yet.
+        """Build the model of the scene. Nothing is simulated yet.
 
         Args:
-            disturbance: (3,) acceleration beside the motion's, world frame [m/s^2].
+            workcell: the cell.
+            settings: settings of the simulation; None for the defaults.
+            disturbance: (3,) acceleration that the pads have to give the box in addition to the
+                motion's, world frame [m/s^2].
 
         Raises:
             SimulationError: MuJoCo is not installed.
-            SettingsError: the hands of the cell hold by themselves.
+            SettingsError: the cell has hands that hold without a squeeze.
         """
         self.workcell = workcell
         self.settings = settings or SimulationSettings()
@@ -361,7 +372,8 @@ class BoxSimulation:
         self._model = cache(self._compiled)
 
     def simulate(self, drive: Drive, factor: float = 1.0) -> Outcome:
-        """Simulate one carry with the pressing force times a factor, up to its end or to a slip."""
+        """Simulate one carry with the pressing force times a factor, until its end or until the box
+        slips."""
         mujoco, model, settings = self._mujoco, self._model(drive.leader), self.settings
         data = mujoco.MjData(model)
         held = HeldBox(model, data, self.workcell)
@@ -400,8 +412,9 @@ class BoxSimulation:
 
 
 def workcell_of_case(workcell: Workcell, case: Array) -> Workcell:
-    """Return the workcell of a case (18,), see `symbolic.contact.worst_cases.CASE_SIZES`, except
-    the disturbance and the arms' errors."""
+    """Return the workcell with the values of a case (18,), laid out by
+    `symbolic.contact.worst_cases.CASE_SIZES`. The disturbance and the errors of the arms are not
+    part of a workcell and left out."""
     payload = workcell.payload
     mass, centre = float(case[4]), case[5:8]
     # The inertia is known about the nominal centre of mass: Steiner's theorem takes it to the true.

@@ -1,14 +1,14 @@
-"""Hands that hold by themselves in MuJoCo: with how much force does nothing slip and no rim lift?
+"""Gripping hands in MuJoCo, to find the holding force at which nothing slips and no rim lifts.
 
-The carriage moves as planned and carries one body per hand: a cup on bellows, a magnet or a finger
-on its rubber. Its lip is a set of points, each a spring across the patch; between the lip and the
-carriage the layer gives along the patch and about its normal. Both are one elastic layer of
-`ContactSettings.layer` per area across and a third of that along, that of all hands alike. The
-holding force is the pull of an adhesion actuator on the payload, and hands stand as deep as it
-presses their layers.
+The carriage moves as planned and has one body per hand: a cup on bellows, a magnet, or a finger on
+its rubber. The hand's lip is a set of points, each a spring normal to the patch; between the lip
+and the carriage the layer yields along the patch and about its normal. Both form one elastic layer,
+with the normal stiffness `ContactSettings.layer` per area and a third of it along the patch, equal
+for all hands. The holding force is the pull of an adhesion actuator on the payload, and hands are
+placed such that it compresses their layers.
 
-How hands share a load, when a point slides and which pressure a rim keeps, follow from these
-springs and Coulomb's law at each point. A planned carry gives nothing but its motion.
+The sharing of a load among hands, the sliding of a point and the pressure at a rim follow from
+these springs and Coulomb's law at each point. A planned carry contributes only its motion.
 """
 
 from __future__ import annotations
@@ -45,39 +45,41 @@ from symbolic.errors import SettingsError
 from symbolic.records import Contact, Workcell
 
 HAND_FREQUENCY = 500.0
-"""Of a hand on its layer [rad/s]: it gives a hand's mass, whose inertia is fed forward."""
+"""Natural frequency of a hand on its layer [rad/s]. It determines the mass of a hand, whose inertia
+is fed forward."""
 
 LIP_DAMPING = 0.05
-"""Damping ratio of the layers across their patches. Two hands that face one another cannot give
-way: what slides between them is braked by this damping, times its speed."""
+"""Damping ratio of the layers normal to their patches. Two hands that face each other cannot yield,
+so a sliding contact between them is slowed by this damping."""
 
 SHEAR_DAMPING = 0.7
 """Damping ratio of the layers along their patches, with the payload's mass."""
 
 HAND_SETTINGS = SimulationSettings(settle=0.4)
-"""Usual settings: hands take the payload's weight so slowly that it hardly swings."""
+"""Usual settings. Hands take the payload's weight so slowly that it hardly swings."""
 
 TAKEN = 0.75
-"""Share of the time to settle in which they do."""
+"""Share of the settling time in which hands take the payload's weight."""
 
 RINGS = 3
-"""Rings of points of equal areas that a disc has; a cup's lip has the points of one."""
+"""Number of rings of points with equal areas on a disc. The lip of a cup has the points of one
+ring."""
 
 RIM_PLACES = 32
-"""Places on a hand's rim where slip and lift are measured."""
+"""Number of points on a hand's rim at which slip and lift are measured."""
 
 
 HAND_JOINTS = ("x", "y", "turn")
-"""Of a hand on its layer."""
+"""Names of the joints of a hand on its layer."""
 
 
 @dataclass(frozen=True)
 class HandOutcome(Outcome):
-    """Outcome of one simulation of hands; a factor is one of their holding forces.
+    """Outcome of one simulation of hands. The factor multiplies their holding forces.
 
     Attributes:
-        lift: (n, 2) how far the payload is off the rim of any hand of each robot [m]; negative
-            while all of them press.
+        lift: (n, 2) largest distance of the payload from the rim of any hand of each robot [m];
+            negative while all hands press.
     """
 
     lift: Array
@@ -89,7 +91,7 @@ class HandOutcome(Outcome):
 
 
 class HandSimulation:
-    """The payload of one workcell in its hands.
+    """Simulation of one workcell's payload in its hands.
 
     Attributes:
         workcell, settings: the cell, and settings of the simulation.
@@ -101,10 +103,13 @@ class HandSimulation:
         settings: SimulationSettings | None = None,
         disturbance: ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
-        """Describe the scene; nothing is simulated yet.
+        """Build the model of the scene. Nothing is simulated yet.
 
         Args:
-            disturbance: (3,) acceleration beside the motion's, world frame [m/s^2].
+            workcell: the cell.
+            settings: settings of the simulation; None for `HAND_SETTINGS`.
+            disturbance: (3,) acceleration that the hands have to give the payload in addition to
+                the motion's, world frame [m/s^2].
 
         Raises:
             SimulationError: MuJoCo is not installed.
@@ -121,11 +126,12 @@ class HandSimulation:
     def simulate(
         self, motion: CarriageMotion, holding_force: ArrayLike, factor: float = 1.0
     ) -> HandOutcome:
-        """Simulate one carry up to its end, a slip or a lifted rim.
+        """Simulate one carry until its end, a slip or a lifted rim.
 
         Args:
-            holding_force: of each hand, or (2,) of the hands of either robot [N].
-            factor: multiple of it with which they hold.
+            motion: motion of the carriage.
+            holding_force: holding force of each hand, or (2,) of the hands of either robot [N].
+            factor: multiple of the holding force.
         """
         mujoco, settings = self._mujoco, self.settings
         model = copy(self._model())
@@ -181,10 +187,10 @@ class HandSimulation:
 
 
 class HeldInHands:
-    """Pose of the payload in its hands in one simulation.
+    """Measurement of the payload's pose in its hands in one simulation.
 
     Attributes:
-        each: indices of the hands.
+        each: indices of the bodies of the hands.
     """
 
     def __init__(self, model: Any, data: Any, workcell: Workcell) -> None:
@@ -200,8 +206,8 @@ class HeldInHands:
         self._settled: tuple[Array, Array] | None = None
 
     def look(self) -> tuple[Array, Array, float]:
-        """Measure (2,) largest slip of each robot's hands along their patches since the first call
-        and largest lift off a rim [m], and the rotation since then [rad]."""
+        """Measure, since the first call, the largest slip (2,) of each robot's hands along their
+        patches [m], the largest lift (2,) off a rim [m], and the rotation [rad]."""
         data = self._data
         axes = data.xmat[self._bodies].reshape(-1, 3, 3)
         rotation = data.xmat[self._box].reshape(3, 3)
@@ -220,8 +226,8 @@ class HeldInHands:
 
 
 def swing_frequency(workcell: Workcell, settings: SimulationSettings = HAND_SETTINGS) -> float:
-    """Compute the lowest frequency with which the payload swings on the layers of its hands, on
-    arms that stand still [Hz]."""
+    """Compute the lowest frequency with which the payload swings on the layers of its hands while
+    the arms are at rest [Hz]."""
     payload = workcell.payload
     maps = [wrench_to_box(hand) for hand in workcell.pads]
     stiffness = sum(
@@ -237,10 +243,12 @@ def swing_frequency(workcell: Workcell, settings: SimulationSettings = HAND_SETT
 
 
 def lip_points(hand: Contact, points: int) -> Array:
-    """Compute points (n, 2) of a hand that press on the payload, with the patch's mean squares [m].
+    """Compute the points (n, 2) of a hand that press on the payload [m]. Their mean squares equal
+    those of the patch.
 
     Args:
-        points: about how many a patch has; a cup's lip has a third of them.
+        hand: the hand.
+        points: approximate number of points of a patch; the lip of a cup has a third of them.
     """
     if hand.half_sides is None:
         angle = 2.0 * np.pi * np.arange(points // RINGS) / (points // RINGS)
@@ -258,14 +266,15 @@ def lip_points(hand: Contact, points: int) -> Array:
 
 
 def _along(hand: Contact, settings: SimulationSettings) -> tuple[float, float]:
-    """Return the stiffness of a hand's layer along it and about its normal [N/m, N m/rad]."""
+    """Return the stiffness of a hand's layer along the patch [N/m] and about its normal [N
+    m/rad]."""
     points = lip_points(hand, settings.points)
     shear = SHEAR * settings.layer * hand.area
     return shear, shear * float((points**2).sum(axis=1).mean())
 
 
 def _own(hand: Contact, settings: SimulationSettings, motion: CarriageMotion) -> Array:
-    """Compute the forces (n, 3) that move a hand itself along its joints [N, N m]."""
+    """Compute the forces (n, 3) along its joints that accelerate a hand itself [N, N m]."""
     inertia = np.array(_along(hand, settings)) / HAND_FREQUENCY**2
     R = hand.T_box_pad[:3, :3]
     linear = motion.acceleration_at(hand.T_box_pad[:3, 3]) @ R[:, :2]
@@ -275,10 +284,10 @@ def _own(hand: Contact, settings: SimulationSettings, motion: CarriageMotion) ->
 
 
 def _hand_text(hand: Contact, settings: SimulationSettings, k: int, borne: float) -> str:
-    """Write a hand as a body of the carriage.
+    """Return a hand as MJCF, a body of the carriage.
 
     Args:
-        borne: its share of the payload's mass [kg].
+        borne: share of the payload's mass that the hand bears [kg].
     """
     shear, torsion = _along(hand, settings)
     mass, inertia = shear / HAND_FREQUENCY**2, torsion / HAND_FREQUENCY**2

@@ -1,12 +1,12 @@
 """References of a simulated cell, and the controllers that follow them.
 
-References say where joints have to be, and how hard pads press. Controllers are as real cells have
-them: joint impedance, and force control along the contact normal. All feed forward the arms' own
-inverse dynamics and the planned forces at the pads, but no moments: these are left to stiffness.
-`impedance`: every joint is a spring and a damper about its reference. `leader`: so is the leading
-arm; the other has no stiffness along the normal and an integral control of its normal force
-instead. `both`: both are so, with the mean of their force errors and a weak spring along the normal
-each, since nothing else keeps the box in its place between them.
+References state the joint positions and the normal forces of the pads over time. Controllers are
+those of real cells: joint impedance, and force control along the contact normal. All feed forward
+the arms' own inverse dynamics and the planned forces at the pads, but no moments, which are left to
+stiffness. `impedance`: every joint is a spring and a damper about its reference. `leader`: the
+leading arm has joint impedance; the other arm has no stiffness along the normal and an integral
+control of its normal force instead. `both`: both arms control the mean of their force errors and
+have a weak spring along the normal, since nothing else keeps the box in its place between them.
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ from symbolic.records.poses import box_rotation, inverse
 from symbolic.robot.model import build_robot_model
 
 REST_TIME = 0.3
-"""Time at rest before a carry begins [s]."""
+"""Time at rest before a carry [s]."""
 
 STANDS = 0.1
-"""Time of it for which something else still holds the box [s]."""
+"""Part of this time in which a support still holds the box [s]."""
 
 TOUCHES = 5.0
-"""Reference of a normal force from which on force control has taken over whole [N]."""
+"""Force control is fully active from this reference of the normal force on [N]."""
 
 
 @dataclass(frozen=True, eq=False)
 class JointMotion:
-    """Both arms' joints stacked at n moments, times not decreasing.
+    """Joints of both arms, stacked, at n times that do not decrease.
 
     Attributes:
         time: (n,) [s].
@@ -59,7 +59,7 @@ class JointMotion:
 
 @dataclass(frozen=True, eq=False)
 class BoxJob:
-    """The job of the box.
+    """Start, goal and support of the box in a simulation.
 
     Attributes:
         start: (6,) first pose of the box [m, rad].
@@ -76,17 +76,16 @@ class BoxJob:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """References of a whole job at n moments.
+    """References of a whole job at n times.
 
     Attributes:
-        workcell: the cell as it was planned for.
-        motion: the joints.
-        normal_force: (n, 2) force that each pad has to press with; zero where it need not touch
-            [N].
+        workcell: the cell for which the job was planned.
+        motion: motion of the joints.
+        normal_force: (n, 2) commanded normal force of each pad; zero while it need not touch [N].
         effort: (n, all joints) joint torques to feed forward, pressing included [N m].
-        press_torque: (n, all joints) torques of each arm's joints that press with 1 N.
-        job: of the box.
-        leader: index of the arm that keeps its place where the other alone controls its force.
+        press_torque: (n, all joints) torques of each arm's joints per newton of normal force.
+        job: start, goal and support of the box.
+        leader: index of the arm that keeps its place, if only the other arm controls its force.
     """
 
     workcell: Workcell
@@ -105,16 +104,19 @@ def job_reference(
     job: BoxJob,
     effort: Array | None = None,
 ) -> Reference:
-    """Build references from joints and forces.
+    """Build references from joint motion and normal forces.
 
     Args:
-        normal_force: (n, 2) force that each pad has to press with [N].
+        workcell: the cell.
+        motion: motion of the joints at n times.
+        normal_force: (n, 2) commanded normal force of each pad [N].
+        job: start, goal and support of the box.
         effort: (n, all joints) joint torques to feed forward: inverse dynamics and the contacts'
-            wrenches, pressing included; without, inverse dynamics and pressing, so that the
-            controllers' stiffness has to carry the box [N m].
+            wrenches, pressing included [N m]. None for inverse dynamics and pressing alone; the
+            controllers' stiffness then has to carry the box.
 
     Raises:
-        SettingsError: the arrays do not fit one another, or times decrease.
+        SettingsError: the shapes of the arrays do not fit, or times decrease.
     """
     n, joints = motion.q.shape
     if motion.q_rate.shape != (n, joints) or motion.q_second.shape != (n, joints):
@@ -139,16 +141,19 @@ def job_reference(
 def carry_reference(
     cell: Cell, carry: Carry, press: Array | None = None, leader: int = 0
 ) -> Reference:
-    """Build the reference of a carry from rest to rest, after some time at rest, with the forces of
-    its planned wrenches.
+    """Build the reference of a carry from rest to rest, after some time at rest. It feeds forward
+    the forces of the planned wrenches.
 
     Args:
-        press: (n,) normal force to command the arm that does not lead; its planned one by default
-            [N].
-        leader: index of the arm whose force is the planned one and what the other adds.
+        cell: the cell.
+        carry: the carry at n samples.
+        press: (n,) commanded normal force of the arm that does not lead [N]; None for its planned
+            force.
+        leader: index of the leading arm. Its force is the planned one plus the additional force of
+            the other arm.
 
     Raises:
-        SettingsError: the carry does not start and end at rest, or the force does not fit it.
+        SettingsError: the carry does not start and end at rest, or `press` has another shape.
     """
     refuse_motion_at_ends(carry)
     planned = carry.normal_force[:, 1 - leader]
@@ -196,13 +201,15 @@ def carry_reference(
 def with_tracking_error(
     reference: Reference, amplitude: float, rng: np.random.Generator, opposed: float = 0.0
 ) -> Reference:
-    """Return references with a random sinusoidal error of each joint, starting at zero, and arms
-    that push against each other.
+    """Return references with a random sinusoidal error of each joint that starts at zero, and with
+    arms that push against each other.
 
-    Frequencies are drawn from 0.3 to 1.5 Hz. All else that is fed forward stays.
+    Frequencies are drawn from 0.3 to 1.5 Hz. All other references stay the same.
 
     Args:
-        amplitude: of each joint's sinusoid [rad].
+        reference: the references.
+        amplitude: amplitude of each joint's error [rad].
+        rng: generator of frequencies and directions.
         opposed: force of either arm along the first pad's face, in a random direction [N].
     """
     workcell, turned = reference.workcell, rng.uniform(0.0, 2.0 * np.pi)
@@ -221,11 +228,11 @@ def with_tracking_error(
 
 
 def press_torque(workcell: Workcell, q: Array) -> Array:
-    """Compute the torques (n, all joints) of each arm's joints that press with 1 N, at joints (n,
-    all).
+    """Compute the torques (n, all joints) of each arm's joints per newton of normal force, at
+    joints q (n, all joints).
 
-    Both press along the normals where these are opposite, else along the line between the middles
-    of their pads, so that what they add cancels in the payload.
+    Both arms press along the normals if these are opposite, else along the line between the middles
+    of their pads. So the additional forces cancel in the payload.
     """
     middles = [
         np.mean([pad.T_box_pad[:3, 3] for pad in (contact, *contact.further)], axis=0)
@@ -240,8 +247,8 @@ def press_torque(workcell: Workcell, q: Array) -> Array:
 
 
 def _force_torque(workcell: Workcell, q: Array, forces: tuple[Array, Array]) -> Array:
-    """Compute the torques (n, all joints) of forces (3,) or (n, 3) on the box, in its frame, one of
-    each robot in the middle of its pads [N m]."""
+    """Compute the joint torques (n, all joints) [N m] of forces of both robots on the box. Each
+    force, (3,) or (n, 3) in the box frame, acts in the middle of the robot's pads."""
     found = []
     parts = zip(workcell.robots, workcell.contacts, forces, joints_of(workcell, q), strict=True)
     for robot, contact, force, values in parts:
@@ -260,7 +267,7 @@ def _force_torque(workcell: Workcell, q: Array, forces: tuple[Array, Array]) -> 
 
 
 def inverse_dynamics(workcell: Workcell, motion: JointMotion) -> Array:
-    """Compute the torques (n, all joints) that move the bare arms [N m]."""
+    """Compute the torques (n, all joints) [N m] that move the arms without contacts."""
     found = []
     parts = [joints_of(workcell, values) for values in (motion.q, motion.q_rate, motion.q_second)]
     for robot, *rows in zip(workcell.robots, *parts, strict=True):
@@ -275,7 +282,7 @@ def _counts(workcell: Workcell) -> list[int]:
 
 
 def _with_rest(values: Array, keep: float) -> Array:
-    """Prepend two rows: the first one, times `keep`."""
+    """Prepend two rows of rest: copies of the first row, times `keep`."""
     return np.concatenate([keep * values[:1], keep * values[:1], values])
 
 
@@ -284,13 +291,13 @@ Control = Literal["impedance", "leader", "both"]
 
 @dataclass(frozen=True, eq=False)
 class ArmState:
-    """One arm at one moment.
+    """Measured state of one arm at one time.
 
     Attributes:
-        error, error_rate: (n_joints,) reference less position, and its rate [rad, s].
+        error, error_rate: (n_joints,) reference minus position, and its rate [rad, s].
         jacobian: (6, n_joints) Jacobian of the pad, linear velocities first, world axes.
         normal: (3,) normal of the pad into the box, world axes.
-        force: normal force, as measured or as both arms share it [N].
+        force: measured normal force, or the mean of both arms' forces [N].
     """
 
     error: Array
@@ -304,7 +311,7 @@ class ArmController:
     """Controller of one arm, with the integral of its force error.
 
     Attributes:
-        is_force_controlled: whether it controls its force along the normal.
+        is_force_controlled: whether the arm controls its force along the normal.
     """
 
     def __init__(
@@ -315,12 +322,14 @@ class ArmController:
         is_force_controlled: bool,
         drift_stiffness: float,
     ) -> None:
-        """Start with no integral.
+        """Start with a zero integral.
 
         Args:
+            settings: settings of the controllers.
             gains: stiffness and damping of the joints [N m/rad, N m s/rad].
-            pad_stiffness: of the pads' layers; without force control, the arm aims as far beyond
-                the contact as they give [N/m].
+            pad_stiffness: stiffness of the pads' layers [N/m]. Without force control, the arm aims
+                beyond the contact by the compression of the layers.
+            is_force_controlled: whether the arm controls its force along the normal.
             drift_stiffness: remaining stiffness along the normal [N/m].
         """
         self.is_force_controlled = is_force_controlled
@@ -334,8 +343,9 @@ class ArmController:
         """Compute the joint torques (n_joints,) [N m].
 
         Args:
-            effort: (n_joints,) to feed forward [N m].
-            normal_force: reference [N].
+            state: measured state of the arm.
+            effort: (n_joints,) joint torques to feed forward [N m].
+            normal_force: reference of the normal force [N].
         """
         pressed, moved = 0.0, -normal_force / self._pad_stiffness
         along = state.normal @ state.jacobian[:3]
@@ -355,28 +365,32 @@ class ArmController:
 
 
 def pressed_reference(cell: Cell, carry: Carry, leader: int = 0) -> tuple[Reference, Squeeze]:
-    """Build a job's reference: with robust forces if the workcell states its uncertainty, smoothed
-    so that controllers can follow them and never below the needed ones."""
+    """Build the reference of a carry with the commanded forces of a job, and return it with how the
+    forces came about.
+
+    The forces are robust if the workcell states its uncertainty. They are smooth, so controllers
+    can follow them, and never below the needed forces.
+    """
     forces, squeeze = commanded_forces(cell.workcell, carry, SqueezeSettings(leader=leader))
     return carry_reference(cell, carry, forces[:, 1 - leader], leader), squeeze
 
 
 def driven_carry(cell: Cell, x: Array) -> Carry:
-    """Compute a decision vector's carry from rest to rest, timed as in a job.
+    """Compute the carry of a decision vector x (n_var,) from rest to rest, timed as in a job.
 
     Raises:
-        SimulationError: there is none.
-        JobError: there is none without jumps of acceleration.
+        SimulationError: the path has no timing.
+        JobError: there is no timing without jumps of acceleration.
     """
     return exported_carry(cell, driven_timing(cell.timing_model, x))
 
 
 def exported_carry(cell: Cell, timing: Timing) -> Carry:
-    """Compute the carry of a timing, timed as in a job.
+    """Compute the carry of a timing as a job drives it, without jumps of acceleration.
 
     Raises:
-        SimulationError: there is none.
-        JobError: there is none without jumps of acceleration.
+        SimulationError: the timing has no carry.
+        JobError: there is no timing without jumps of acceleration.
     """
     if not timing.ok or timing.carry is None:
         raise SimulationError(

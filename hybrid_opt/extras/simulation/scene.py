@@ -1,14 +1,14 @@
 """MJCF of the simulated scenes: a free box between two pads on a carriage, and the whole cell.
 
-Each pad is a set of small spheres that touch the face of the box: all over its patch, for an
-elastic pad that presses evenly while an arm keeps its orientation. On the carriage the leader's pad
-is fixed, the other slides along its normal. Gravity does not act on carriage and pads, which are
-driven.
+Each pad is a set of small spheres that touch the face of the box. They are spread over the whole
+patch for an elastic pad that presses evenly while an arm keeps its orientation. On the carriage the
+leader's pad is fixed, the other slides along its normal. Gravity does not act on carriage and pads,
+which are driven.
 
-The whole cell has both arms with their links' masses, pads, box and environment. Joints are as in
-the workcell's kinematic model, moved by torques. Pads touch the box, the box touches the
-environment; everything else is there for its mass and to be looked at: collisions of the arms are
-ruled out elsewhere (`hybrid_opt.collision`).
+The whole cell has both arms with their links' masses, pads, box and environment. Joints are those
+of the workcell's kinematic model, moved by torques. Pads touch the box, and the box touches the
+environment. Other bodies have mass and are visible, but do not collide: `hybrid_opt.collision`
+checks the arms.
 """
 
 from __future__ import annotations
@@ -33,14 +33,15 @@ from symbolic.records.poses import inverse, pose_matrix
 from symbolic.records.quantities import GRAVITY
 
 CARRIAGE_MASS = 1e5
-"""[kg], and [kg m^2] about every axis: what the box does to the carriage within a step is lost in
-it, and its state is set anew at each step."""
+"""Mass of the carriage [kg], and its inertia about every axis [kg m^2]. It is so large that the box
+hardly moves the carriage within a step, and the carriage's state is set anew at each step."""
 
 PAD_MASS = 10.0
-"""[kg]; its inertia is fed forward."""
+"""Mass of a pad [kg]; its inertia is fed forward."""
 
 PAD_INERTIA = 2e-3
-"""Inertia of a pad [kg m^2]; what its turning takes is lost in the planned moments."""
+"""Inertia of a pad [kg m^2]. The moments that rotate it are negligible beside the planned
+moments."""
 
 TILT_STIFFNESS = 20.0
 """Tilt stiffness of each driven pad about the axes in its plane [N m/rad]."""
@@ -49,35 +50,37 @@ TILT_DAMPING_TIME = 2e-3
 """Damping of a pad's tilt over its stiffness [s]."""
 
 POINT_RADIUS = 2e-3
-"""Radius of the spheres [m]."""
+"""Radius of the spheres at contact points [m]."""
 
 PLATE_REACH, PLATE_THICKNESS = 3.0, 0.01
-"""Half the side of a plate under a pad over the patch's radius, and its thickness [m]."""
+"""Half the side of a plate under a pad, over the patch's radius; and its thickness [m]."""
 
 IMPEDANCE = 0.1
-"""MuJoCo's d of the pads' contacts: the less, the less their regularisation weighs."""
+"""MuJoCo's impedance d of the pads' contacts. Smaller values reduce the effect of their
+regularisation."""
 
 LAYER_DAMPING = 0.7
-"""Damping ratio of a pad's layer. With less the pads lose contact where accelerations jump; with
-more a pad that slides is pushed off by its damping, which widens its pressure."""
+"""Damping ratio of a pad's layer. With less damping the pads lose contact where accelerations jump.
+With more damping a sliding pad is pushed off, which widens its pressure."""
 
 CREEP = 3e3
 """MuJoCo's impratio: the factor by which frictional contacts creep less than normal ones."""
 
 MUJOCO_TOLERANCE = 1e-12
-"""MuJoCo's tolerance of a step's solution in a cell without a carriage. MuJoCo takes it times the
-mean inertia: with that of the carriage among them, held boxes of many points drift by 0.3 mm/s."""
+"""MuJoCo's tolerance of a step's solution in a cell without a carriage. MuJoCo multiplies it by the
+mean inertia; with that of the carriage included, held boxes with many points drift by 0.3 mm/s."""
 
 SUPPORT = 'solref="0.01 1" solimp="0.7 0.7 0.001"'
-"""Contact of the box with its support. Much stiffer ones lose touch where accelerations jump."""
+"""Contact parameters of the box on its support. Much stiffer contacts lose touch where
+accelerations jump."""
 
 LARGEST_TIME_STEP = 2e-3
-"""Longest step; with longer ones the pads' layers are too stiff to be followed [s]."""
+"""Largest time step [s]. With a larger one the pads' layers are too stiff to be integrated."""
 
 Pads = Literal["even", "driven"]
 
 PRESSES = 1
-"""The bit of what presses on the box, among MuJoCo's types of contacts."""
+"""Bit of MuJoCo's contact types for bodies that press on the box."""
 
 SOLID = 'contype="2" conaffinity="0"'
 
@@ -89,8 +92,8 @@ class ContactSettings:
     """Settings of simulated contacts, of pads alone and of whole cells.
 
     Attributes:
-        time_step: of the physics [s].
-        points: about how many contact points a patch has.
+        time_step: time step of the physics [s].
+        points: approximate number of contact points of a patch.
         layer: stiffness of the pads' elastic layer per area [N/m^3]; the usual one is rubber of
             2 MPa, 5 mm thick.
         slip: displacement in the plane of a pad that counts as slip [m].
@@ -122,8 +125,8 @@ class SimulationSettings(ContactSettings):
 
     Attributes:
         pads: 'even' for points all over the patches of pads that keep their planned orientation;
-            'driven' for what the allocation `paper` assumes: points at the rim of a
-            round patch or the corners of a rectangle, turned by the planned moments.
+            'driven' for pads as the allocation `paper` assumes them: points at the rim of a round
+            patch or at the corners of a rectangle, turned by the planned moments.
         settle: time at rest before the carry begins [s].
     """
 
@@ -141,15 +144,15 @@ class ArmSettings(ContactSettings):
     """Settings of the simulated cell and its controllers.
 
     Attributes:
-        control_period: of the controllers, a multiple of the time step [s].
-        arrival: how far from its goal the box may end [m].
-        stiffness: of each joint over its largest torque [1/rad].
-        damping_ratio: of each joint with the inertia that it moves at the start.
-        armature: inertia of a motor seen from behind its gear, over the joint's largest torque
-            [kg m^2 / (N m)]; no description of a robot states it.
-        force_gain: of the integral force control [1/s].
-        drift_stiffness: along the normal, of each arm where both are force-controlled [N/m].
-        support_friction: between the box and its support.
+        control_period: period of the controllers, a multiple of the time step [s].
+        arrival: largest distance from its goal at which the box may end [m].
+        stiffness: stiffness of each joint over its largest torque [1/rad].
+        damping_ratio: damping ratio of each joint with the inertia that it moves at the start.
+        armature: inertia of a motor at the output of its gear, over the joint's largest torque [kg
+            m^2 / (N m)]. Descriptions of robots do not state it.
+        force_gain: gain of the integral force control [1/s].
+        drift_stiffness: stiffness of each arm along the normal if both are force controlled [N/m].
+        support_friction: friction coefficient between the box and its support.
     """
 
     control_period: float = 1e-3
@@ -177,12 +180,14 @@ class ArmSettings(ContactSettings):
 def scene_text(
     workcell: Workcell, settings: SimulationSettings, leader: int, disturbance: ArrayLike
 ) -> str:
-    """Write the MJCF document of pads alone; see `compiled`.
+    """Return the MJCF document of a box between driven pads, for `compiled`.
 
     Args:
         leader: index of the pad that is fixed to the carriage.
-        disturbance: (3,) acceleration that the pads have to give the box beside the motion's,
-            world frame [m/s^2]; it acts like a change of gravity.
+        workcell: the cell.
+        settings: settings of the simulation.
+        disturbance: (3,) acceleration that the pads have to give the box in addition to the
+            motion's, world frame [m/s^2]. It acts like a change of gravity.
     """
     pads = "\n".join(_pad_text(workcell, settings, i, slides=i != leader) for i in (0, 1))
     return carriage_text(workcell, settings, disturbance, pads)
@@ -195,7 +200,7 @@ def carriage_text(
     bodies: str,
     actuators: str = "",
 ) -> str:
-    """Write the MJCF document of a free payload between the bodies of a carriage."""
+    """Return the MJCF document of a free payload between the bodies of a carriage."""
     payload, touched = workcell.payload, 'contype="0" conaffinity="1"'
     if presses_on_box(workcell):
         faces = f'<geom type="box" size="{mjcf_text(payload.size / 2.0)}" {touched}/>'
@@ -219,13 +224,16 @@ def carriage_text(
 
 
 def compiled(mujoco: ModuleType, text: str, damping: float = LAYER_DAMPING) -> tuple[Any, str]:
-    """Compile the simulator's model of a scene; also return the scene as MuJoCo reads it.
+    """Compile the simulator's model of an MJCF document. Return the model, and the document as
+    MuJoCo reads it.
 
-    The pads' points state their stiffness [N/m] as negative `solref`. MuJoCo wants it times a
-    regularisation, which follows from the masses that are compiled.
+    The pads' points state their stiffness [N/m] as negative `solref`. MuJoCo needs it multiplied by
+    a regularisation, which follows from the masses of the compiled model.
 
     Args:
-        damping: ratio of the points' layers.
+        mujoco: the simulator's module.
+        text: the document.
+        damping: damping ratio of the points' layers.
     """
     scene = mujoco.MjSpec.from_string(text)
     model = scene.compile()
@@ -242,7 +250,8 @@ def compiled(mujoco: ModuleType, text: str, damping: float = LAYER_DAMPING) -> t
 
 
 def box_body(payload: Payload, geoms: str) -> str:
-    """Write the free body `box` with the payload's mass and inertia, and the given geoms."""
+    """Return the free body `box` with the payload's mass and inertia and the given geoms, as
+    MJCF."""
     about = payload.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     return f"""<body name="box">
       <freejoint name="box"/>
@@ -253,7 +262,8 @@ def box_body(payload: Payload, geoms: str) -> str:
 
 
 def solver_options(settings: ContactSettings, gravity: Array, heaviest: float = 1.0) -> str:
-    """Write MuJoCo's options: elliptic cones, solved to many digits, with hardly any creep.
+    """Return MuJoCo's options as MJCF: elliptic cones, solved to many digits, with hardly any
+    creep.
 
     Args:
         heaviest: mass of a body much heavier than the box, if any [kg].
@@ -266,11 +276,11 @@ def solver_options(settings: ContactSettings, gravity: Array, heaviest: float = 
 def contact_points(
     contact: Contact, settings: ContactSettings, T_body_pad: Array, pads: Pads = "even"
 ) -> str:
-    """Write spheres at the contact points of a robot's patches, touching their planes, as geoms of
-    the body that holds its pads.
+    """Return spheres at the contact points of a robot's patches, as geoms of the body with its
+    pads. The spheres touch the planes of the patches.
 
     Args:
-        T_body_pad: (4, 4) of the first pad.
+        T_body_pad: (4, 4) first pad in the frame of the body.
     """
     T_body_box = T_body_pad @ inverse(contact.T_box_pad)
     text = []
@@ -282,7 +292,7 @@ def contact_points(
 
 
 def point_geoms(pad: Contact, layer: float, points: Array, T_body_pad: Array) -> str:
-    """Write spheres at points (n, 2) of a pad, touching its plane, as geoms of a body."""
+    """Return spheres at points (n, 2) of a pad, touching its plane, as geoms of a body."""
     in_pad = np.column_stack([points, np.full(len(points), -POINT_RADIUS)])
     stiffness = layer * pad.area / len(points)
     return "\n".join(
@@ -299,13 +309,13 @@ def patch_area(contact: Contact) -> float:
 
 
 def pressed_places(contact: Contact, pads: Pads, points: int) -> Array:
-    """Compute the points (n, 2) of a patch, in its pad's plane, that press on the payload [m].
+    """Compute the points (n, 2) of a patch that press on the payload, in the plane of the pad [m].
 
-    Those of driven pads lie evenly around a round patch's rim, and at the corners of a rectangle:
-    all that presses on its sides could be shared by them and twists less.
+    Points of driven pads lie evenly around the rim of a round patch, or at the corners of a
+    rectangle. The corners can carry every load of the sides, with the largest lever for torsion.
 
     Args:
-        points: about how many.
+        points: approximate number of points.
     """
     if pads == "driven":
         return rim(contact, points if contact.half_sides is None else 4)
@@ -323,16 +333,16 @@ def pressed_places(contact: Contact, pads: Pads, points: int) -> Array:
 
 
 def tilt_centre(contact: Contact) -> Array:
-    """Compute the middle (3,) of a robot's pads, along the axes of the first from its origin [m],
-    where a force is shared evenly."""
+    """Compute the middle (3,) of a robot's pads [m], where a force is shared evenly, from the
+    origin and along the axes of the first pad."""
     places = np.mean([pad.T_box_pad[:3, 3] for pad in (contact, *contact.further)], axis=0)
     T = contact.T_box_pad
     return np.asarray(T[:3, :3].T @ (places - T[:3, 3]))
 
 
 def rim(contact: Contact, points: int) -> Array:
-    """Compute points (n, 2) on a patch's rim in its pad's plane [m]: evenly around, or evenly along
-    the sides of a rectangle, corners included."""
+    """Compute points (n, 2) on the rim of a patch in the plane of the pad [m]: evenly around a
+    round patch, or evenly along the sides of a rectangle, corners included."""
     if contact.half_sides is None:
         angles = 2.0 * np.pi * np.arange(points) / points
         return contact.patch_radius * np.column_stack([np.cos(angles), np.sin(angles)])
@@ -355,12 +365,13 @@ def presses_on_box(workcell: Workcell) -> bool:
 
 
 def plates(workcell: Workcell, touched: str) -> str:
-    """Write a flat plate under each pad, as geoms of the box: the contact surface of other shapes.
+    """Return a flat plate under each pad, as geoms of the box. The plates are the contact surface
+    of payloads that are not boxes.
 
-    The planner takes patches for flat; a pad takes the shape of the payload.
+    The planner assumes flat patches; real pads adapt to the shape of the payload.
 
     Args:
-        touched: attributes that say what may touch them.
+        touched: attributes that state which bodies may touch the plates.
     """
     text = []
     for pad in workcell.pads:
@@ -372,7 +383,7 @@ def plates(workcell: Workcell, touched: str) -> str:
 
 
 def piece_geom(piece: Piece, touch: str, meshes: list[str]) -> str:
-    """Write a piece as a geom; add a hull's mesh to the assets."""
+    """Return a piece as a geom. The mesh of a hull is added to the assets `meshes`."""
     shape = piece.shape
     match shape:
         case Box():
@@ -397,7 +408,7 @@ def tilt_names(robot: int) -> tuple[str, str]:
 
 
 def pad_site(robot: int, T_body_pad: Array) -> str:
-    """Write the site of a robot's first pad."""
+    """Return the site of a robot's first pad as MJCF."""
     return f'<site name="pad_{robot + 1}" {placed(T_body_pad)} size="0.005"/>'
 
 
@@ -420,22 +431,22 @@ def _pad_text(workcell: Workcell, settings: SimulationSettings, i: int, slides: 
 
 
 def placed(T: Array) -> str:
-    """Write a transform (4, 4) as MJCF's attributes."""
+    """Return a transform (4, 4) as attributes of MJCF."""
     turn = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
     return f'pos="{mjcf_text(T[:3, 3])}" quat="{mjcf_text(turn)}"'
 
 
 def mjcf_text(values: ArrayLike) -> str:
-    """Write numbers as an attribute's value."""
+    """Return numbers as the value of an MJCF attribute."""
     return " ".join(repr(float(value)) for value in np.ravel(values))
 
 
 def cell_text(workcell: Workcell, settings: ArmSettings) -> str:
-    """Write the MJCF document of a whole cell; see `compiled`.
+    """Return the MJCF document of a whole cell, for `compiled`.
 
     Joints are named `joint_ROBOT_NUMBER`, sites of the pads `pad_1` and `pad_2`, the box `box`. A
-    joint that moves both arms, and the link that it moves, stand in both and are tied together:
-    either arm's effort has the link's whole weight.
+    joint that moves both arms, and its link, occur in both arms and are tied together. The effort
+    of either arm contains the whole weight of the link.
     """
     meshes: list[str] = []
     shown: dict[Frame, list[str]] = {}
@@ -475,8 +486,8 @@ def cell_text(workcell: Workcell, settings: ArmSettings) -> str:
 
 
 def _ties(workcell: Workcell) -> Iterator[str]:
-    """Yield ties between the two copies of each joint that moves both arms, as stiff as steps
-    allow."""
+    """Yield equality constraints between the two copies of each joint that moves both arms, as
+    stiff as the time step allows."""
     names = [tuple(arm_model(robot).names)[1:] for robot in workcell.robots]
     for name in common_joints(workcell.robots):
         first, second = (_name("joint", i, own.index(name)) for i, own in enumerate(names))
@@ -484,7 +495,7 @@ def _ties(workcell: Workcell) -> Iterator[str]:
 
 
 def _arm(workcell: Workcell, settings: ArmSettings, i: int, shown: dict[Frame, list[str]]) -> str:
-    """Write the nested bodies of one arm, its pad on the last."""
+    """Return the nested bodies of one arm as MJCF, with its pad on the last."""
     model, geometry = arm_model(workcell.robots[i]), arm_geometry(workcell, i)
     contact = workcell.contacts[i]
     # The pad stands at the nominal contact, wherever the box is displaced to.
@@ -510,7 +521,7 @@ def _name(kind: str, robot: int, joint: int) -> str:
 
 
 def joint_names(workcell: Workcell) -> list[str]:
-    """Return the names of both arms' joints in the document, stacked."""
+    """Return the names of both arms' joints in the document, first those of arm 1."""
     counts = [len(robot.torque_max) for robot in workcell.robots]
     return [_name("joint", i, j) for i, count in enumerate(counts) for j in range(count)]
 
