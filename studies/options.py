@@ -1,6 +1,7 @@
-"""Options of the programs, each described once; numbers, paths, extras are checked before work.
+"""Options of the programs, each described once. Numbers, paths and extras are checked before any
+work.
 
-Nothing heavy is imported here, so that a mistyped name is answered at once.
+Nothing heavy is imported here, so a mistyped name is reported at once.
 """
 
 from __future__ import annotations
@@ -23,25 +24,25 @@ from symbolic.records.problems import suggestion
 LARGEST_SEED = 2**63 - 1
 
 QUICK_EVALUATIONS, QUICK_REPLICAS = 300, 2
-"""Evaluations and replicas of a small but complete study."""
+"""Number of evaluations and replicas of a small but complete study."""
 
 PADS_DRIVEN = "pads-driven"
 
 HANDS = "hands"
 
 PAD_WITNESSES = ("pads", PADS_DRIVEN)
-"""The witnesses without arms, beside the controllers of those with them."""
+"""Names of the simulations without arms, beside the controllers of simulations with arms."""
 
 Number = TypeVar("Number", int, float)
 
 
 def whole(low: int, high: int) -> Callable[[str], int]:
-    """Return a type of options that takes integers of a range, ends included."""
+    """Return a type of options that takes integers in a range, ends included."""
     return _within(int, low, high, f"a whole number {low} to {high}")
 
 
 def number(low: float, high: float) -> Callable[[str], float]:
-    """Return a type of options that takes finite numbers of a range, ends included."""
+    """Return a type of options that takes finite numbers in a range, ends included."""
     return _within(float, low, high, f"a number {low:g} to {high:g}")
 
 
@@ -62,26 +63,26 @@ def _within(
 
 
 seed = whole(0, LARGEST_SEED)
-"""The type of seeds."""
+"""Type of options that take a seed."""
 
 
 force = number(1e-3, 1e6)
-"""The type of normal forces [N], and of durations [s] and masses [kg] of wishes."""
+"""Type of options that take a normal force [N], or a duration [s] or mass [kg] of a wish."""
 
 
 @dataclass(frozen=True)
 class PathType:
-    """Type of an argument that is a path.
+    """Type of a path argument.
 
     Attributes:
-        check: raises a `DualArmError` for an unsuitable path; called after the whole command line
-            is parsed.
+        check: function that raises a `DualArmError` for an unsuitable path; called after the whole
+            command line is parsed.
     """
 
     check: Callable[[Path], None]
 
     def __call__(self, text: str) -> Path:
-        """Convert the argument."""
+        """Convert the text of the argument to a path."""
         return Path(text)
 
 
@@ -89,14 +90,14 @@ WORKCELL, TRAJECTORY, RESULTS = "a workcell file", "a trajectory file", "a resul
 """Kinds of inputs that are recognised by their content."""
 
 _HEAD_BYTES = 4096
-"""Part of a JSON file in which its format is looked for."""
+"""Number of bytes at the beginning of a JSON file in which its format is looked for."""
 
 _FORMAT = re.compile(rb'"format"\s*:\s*"dual-arm-carry trajectory"')
 _SECTION = re.compile(rb"^\s*\[+\s*(task|payload|robots|contacts)\b", re.MULTILINE)
 
 
 def _kind_of(path: Path) -> str:
-    """Name the content of a path; '' if unknown."""
+    """Return the kind of a file or folder by its content; '' if unknown."""
     if path.is_dir():
         is_study = (path / stated("hybrid_opt.campaign.settings.CONFIGURATION")).exists()
         return RESULTS if is_study else "a folder"
@@ -111,7 +112,8 @@ def _kind_of(path: Path) -> str:
 
 
 def _require_file(path: Path, kind: str = "") -> None:
-    """Refuse what cannot be read as a file, or is recognised as something other than `kind`."""
+    """Check that a path can be read as a file, and that its content is not of another kind than
+    `kind`."""
     try:
         safe_io.require(path, safe_io.MOST_BYTES)
     except OutsideError as error:
@@ -122,7 +124,7 @@ def _require_file(path: Path, kind: str = "") -> None:
 
 
 def _expected(path: Path, kind: str) -> str:
-    """Return the end of a message: the expected kind of file, and its usual place."""
+    """Return the end of a message: the expected kind of file and its usual place."""
     expected = f"; expected is {kind}" if kind else ""
     if not path.exists():
         folder = path.parent
@@ -163,13 +165,14 @@ def _require_any(path: Path) -> None:
 
 
 def _require_recording(path: Path) -> None:
-    """Refuse a recording without any file; one with a file per arm has only RUN.toml."""
+    """Check that a recording has files. A recording with a file per arm may consist of RUN.toml
+    only."""
     if not path.with_suffix(".toml").exists():
         _require_any(path)
 
 
 def _require_place(path: Path) -> None:
-    """Refuse a path that cannot be written or made by this user."""
+    """Check that this user can write to a path or create it."""
     existing = next(each for each in (path, *path.absolute().parents) if each.exists())
     if existing != path and not existing.is_dir():
         raise SettingsError(f"{path}: cannot be made, {existing} is a file")
@@ -214,7 +217,7 @@ def check_paths(parser: argparse.ArgumentParser, options: argparse.Namespace) ->
     """Check every path of a command line, inputs first in the order of the help.
 
     Raises:
-        DualArmError: one is not as the program needs it.
+        DualArmError: a path is not suitable for the program.
     """
     for action in parser._actions:
         value = getattr(options, action.dest, None)
@@ -231,18 +234,18 @@ EXTRAS = {
     "sim": ("mujoco",),
     "video": ("imageio_ffmpeg",),
 }
-"""Modules of the extras of `pyproject.toml` that a program or an option cannot do without."""
+"""Modules of each extra of `pyproject.toml` that a program or an option needs."""
 
 
 def require_extra(extra: str, use: str) -> None:
-    """Refuse a use whose extra is not installed, without importing it.
+    """Check that an extra is installed, without importing it.
 
     Args:
-        extra: of `EXTRAS`.
+        extra: name of the extra in `EXTRAS`.
         use: the feature that needs it, for the message.
 
     Raises:
-        SettingsError: a module of it is missing.
+        SettingsError: a module of the extra is missing.
     """
     missing = [name for name in EXTRAS[extra] if find_spec(name) is None]
     if missing:
@@ -290,10 +293,11 @@ _SHARED: dict[str, dict[str, Any]] = {
 
 
 def add(parser: argparse._ActionsContainer, *names: str, **own: Any) -> None:
-    """Add options that several programs have.
+    """Add options that several programs share.
 
     Args:
-        names: names in the table; positional ones in capitals.
+        parser: parser of the program.
+        names: names in the table of options; positional arguments in capitals.
         own: attributes that differ in this program.
     """
     for name in names:
@@ -302,7 +306,7 @@ def add(parser: argparse._ActionsContainer, *names: str, **own: Any) -> None:
 
 
 def add_wishes(parser: argparse._ActionsContainer) -> None:
-    """Add the wishes for a recommended carry, as `Wish` takes them."""
+    """Add the options of a `Wish` for a recommended carry."""
     parser.add_argument(
         "--duration",
         type=force,
@@ -324,7 +328,7 @@ def add_wishes(parser: argparse._ActionsContainer) -> None:
 
 
 def add_looks(parser: argparse.ArgumentParser) -> None:
-    """Add an animation file and the live view of a study's trajectories."""
+    """Add the options for an animation file and a live view of a study's trajectories."""
     group = parser.add_argument_group("looking at a trajectory")
     group.add_argument(
         "--animation",
@@ -343,18 +347,17 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
 
 
 def stated(name: str) -> Any:
-    """Read a value from the source of a module, without importing the module, which may take
-    seconds.
+    """Read a constant or a default value from the source of a module, without importing the module.
 
     Args:
-        name: of a constant or of a settings' field, with module and class, as
+        name: name of a constant or of a field of settings, with module and class, such as
             'hybrid_opt.campaign.settings.CampaignSettings.seed'.
 
     Returns:
-        The value; of a `Literal` its allowed values, of a table its keys.
+        The value; the allowed values of a `Literal`; the keys of a table.
 
     Raises:
-        LookupError: the source states no such value.
+        LookupError: the source does not state this value.
     """
     package, *parts = name.split(".")
     spec = find_spec(package)
@@ -382,7 +385,7 @@ def _statements(path: Path) -> dict[str, ast.AST]:
 
 
 def _named(body: list[ast.stmt]) -> dict[str, ast.AST]:
-    """Parse the classes of a source, and the values of its names."""
+    """Return the syntax trees of the classes and values of a source, by name."""
     found: dict[str, ast.AST] = {}
     for node in body:
         if isinstance(node, ast.ClassDef):

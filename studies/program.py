@@ -32,14 +32,14 @@ class ReportError(DualArmError):
 
 
 FAULT, BAD_INPUT, INTERRUPTED = 1, 2, 130
-"""Exit codes: of programs that find what is not as it should be; of wrong input; after Ctrl-C."""
+"""Exit codes: a program found a fault in what it checked; wrong input; Ctrl-C."""
 
 VERBOSE = "--verbose"
 
 
 class _Help(argparse.HelpFormatter):
-    """Formatter that states the default of every option, unless its text does; numbers stand as
-    N."""
+    """Formatter that states the default of every option unless the option's text does. Numbers are
+    shown as N."""
 
     def _get_default_metavar_for_optional(self, action: argparse.Action) -> str:
         if action.type is None or isinstance(action.type, PathType):
@@ -74,9 +74,11 @@ class Parser(argparse.ArgumentParser):
     """Parser that reports a mistake in one line, with a suggestion."""
 
     def __init__(self, *, prog: str, description: str | None, further: Sequence[str] = ()) -> None:
-        """Do not abbreviate options; `--help` states their defaults.
+        """Prepare a parser that accepts no abbreviated options and states defaults in `--help`.
 
         Args:
+            prog: name of the program in the usage line.
+            description: description of the program.
             further: options that `--help` only names and `--help-all` explains.
         """
         super().__init__(
@@ -87,7 +89,7 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--help-all", action=_HelpAll, help=told)
 
     def format_usage(self) -> str:
-        """Return the required arguments; the help has the others."""
+        """Return a usage line with the required arguments only; the help has the others."""
         formatter = self._get_formatter()
         words = [
             " ".join([*action.option_strings[:1], str(action.metavar or action.dest.upper())])
@@ -169,18 +171,20 @@ def print_version() -> None:
 class Program:
     """A program: `python -m studies.NAME`, or `dual-arm-carry NAME`.
 
-    What its work needs is imported when it is done, so that `--help` and a mistyped option are
+    Modules for its work are imported when the work begins, so `--help` and a mistyped option are
     answered at once.
 
     Attributes:
-        name: below `studies`.
-        description: of its work, for its help.
-        add_options: adds its options; `--verbose` is there.
-        run: does its work with the options, returns the exit code; or the name, with its module's,
-            of a function that does, its libraries in one thread. Beside the options it finds
-            `called`, as the program was called, and `arguments`, the words of its command line.
+        name: module name below `studies`.
+        description: description of the program, for its help.
+        add_options: function that adds the program's options to a parser that already has
+            `--verbose`.
+        run: function that does the work with the parsed options and returns the exit code; or the
+            full name of such a function, which runs with libraries in one thread. The options also
+            have `called`, the name by which the program was called, and `arguments`, the words of
+            the command line.
         interrupted: text after Ctrl-C.
-        complete: fills in places that follow from other options and requires the extras that the
+        complete: function that derives paths from other options and checks the extras that the
             options need; called before paths are checked.
         further: options that only `--help-all` explains.
     """
@@ -195,12 +199,12 @@ class Program:
 
     @property
     def module(self) -> str:
-        """Module name for `python -m`."""
+        """Name of the program's module for `python -m`."""
         return f"studies.{self.name}"
 
     def parser(self, called: str = "") -> Parser:
-        """Return the parser of its options; `called` is the name in its usage line, '' for `python
-        -m`."""
+        """Return the parser of the program's options. `called` is the name in its usage line; ''
+        for `python -m`."""
         prog = called or f"python -m {self.module}"
         parser = Parser(prog=prog, description=self.description, further=self.further)
         self.add_options(parser)
@@ -213,7 +217,7 @@ class Program:
         return parser
 
     def __call__(self, arguments: Sequence[str] | None = None, called: str = "") -> int:
-        """Run it with a command line, None for the process's own; returns the exit code."""
+        """Run the program with a command line, None for the process's own. Return the exit code."""
         parser = self.parser(called)
         given = list(sys.argv[1:] if arguments is None else arguments)
 
@@ -227,12 +231,12 @@ class Program:
         return carry_out(parser.prog, work, self.interrupted)
 
     def start(self) -> NoReturn:
-        """Run it as a process of its own."""
+        """Run the program as a separate process, and end the process."""
         sys.exit(run_program(self))
 
 
 def _done(name: str, options: argparse.Namespace) -> int:
-    """Import a function and do its work, the libraries in one thread; returns the exit code."""
+    """Import a function by name and call it with libraries in one thread. Return its exit code."""
     from hybrid_opt.workers import one_thread
 
     module, _, function = name.rpartition(".")
@@ -243,10 +247,11 @@ def _done(name: str, options: argparse.Namespace) -> int:
 
 
 def load_workcell(path: Path) -> Workcell:
-    """Load the workcell of a program's arguments.
+    """Load the workcell file that is an argument of a program.
 
     Raises:
-        WorkcellError: with all problems of the file; of a problem file, what completes it.
+        WorkcellError: the file is invalid; the message lists all problems. For a problem file it
+            names the program that completes it.
     """
     from symbolic.read.cell import load
 
@@ -265,10 +270,11 @@ def load_workcell(path: Path) -> Workcell:
 
 
 def run_program(main: Callable[[], int]) -> int:
-    """Run a program's main function as a process of its own; returns the exit code.
+    """Run the main function of a program's process. Return the exit code.
 
-    Warnings of this project are printed once, in one line; those of libraries (divisions by zero,
-    deprecations) only with `--verbose`, also in the processes that this one starts.
+    Warnings of this project are printed once, on one line. Warnings of libraries (divisions by
+    zero, deprecations) are printed only with `--verbose`. The same holds in processes that this one
+    starts.
     """
     _show_warnings(verbose=VERBOSE in sys.argv[1:])
     for stream in (sys.stdout, sys.stderr):
@@ -302,8 +308,8 @@ def run_program(main: Callable[[], int]) -> int:
 
 
 def _leave() -> None:
-    """End the process at once if threads are at work, because the interpreter would wait for them.
-    Files are replaced in one step, so that none is left half written."""
+    """End the process at once if threads are running, because the interpreter would wait for them.
+    Files are replaced in one step, so none is left half written."""
     main = threading.main_thread()
     if any(not each.daemon for each in threading.enumerate() if each is not main):
         sys.stderr.flush()
@@ -311,11 +317,11 @@ def _leave() -> None:
 
 
 def carry_out(program: str, work: Callable[[], int], interrupted: str = "interrupted") -> int:
-    """Do a program's work; what goes wrong ends in one message and an exit code.
+    """Do the work of a program. An error ends in one message and an exit code.
 
     Args:
-        program: how it is called, in front of the message.
-        work: returns the exit code.
+        program: name of the program, in front of the message.
+        work: function that does the work and returns the exit code.
         interrupted: text after Ctrl-C.
     """
     try:
@@ -329,8 +335,8 @@ def carry_out(program: str, work: Callable[[], int], interrupted: str = "interru
 
 
 def _show_warnings(verbose: bool) -> None:
-    """Print every warning of this project once, and all others if verbose, without a line of source
-    code."""
+    """Print every warning of this project once, and all other warnings if verbose, without a line
+    of source code."""
     told: set[str] = set()
 
     def show(message: Warning | str, category: type[Warning], *_: object, **__: object) -> None:
@@ -355,8 +361,8 @@ class ProgramResult:
     """One result of a program.
 
     Attributes:
-        values: by name, for JSON; `dataclasses.asdict` converts records.
-        lines: the same for people.
+        values: values by name, for JSON; `dataclasses.asdict` converts records.
+        lines: the same result as lines of text.
     """
 
     values: Mapping[str, Any]
@@ -364,7 +370,7 @@ class ProgramResult:
 
 
 def print_findings(findings: Iterable[ProgramResult], as_json: bool) -> None:
-    """Print each result when it is found, or all at the end as one JSON object."""
+    """Print each result as soon as it exists, or all at the end as one JSON object."""
     values: dict[str, Any] = {}
     for finding in findings:
         values |= finding.values

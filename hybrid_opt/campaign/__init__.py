@@ -1,4 +1,4 @@
-"""Campaigns: algorithms times replicas with equal budgets, stored safely."""
+"""Campaigns: several replicas of every algorithm with equal budgets, stored in a results folder."""
 
 from hybrid_opt.campaign.folder import CampaignFolder, ExecutionSettings, open_folder, workers_for
 from hybrid_opt.campaign.search_stage import search_stage

@@ -1,7 +1,7 @@
-"""Evaluated candidates of a search as one compressed CSV file; docs/reference/results.md has its
+"""Evaluated candidates of a search as one compressed CSV file; docs/reference/results.md lists its
 columns.
 
-The first line is a comment with the time that the search took. Numbers have the fewest digits that
+The first line is a comment with the duration of the search. Numbers have the fewest digits that
 give the same bits when read back.
 """
 
@@ -31,8 +31,8 @@ _LONGEST_LINE = 1_000_000
 
 _ROOM = 2**24
 _BYTES_PER_NUMBER = 2
-"""A file may hold `_ROOM` numbers, and one more per `_BYTES_PER_NUMBER` of its bytes. Zeros can be
-packed much tighter, but evaluated candidates hold more digits than zeros."""
+"""A file may contain `_ROOM` numbers, and one more per so many of its bytes. Zeros can be packed
+tighter, but evaluated candidates have more digits than zeros."""
 
 
 @dataclass(frozen=True)
@@ -41,8 +41,8 @@ class EvaluatedCandidates:
 
     Attributes:
         evaluations: every candidate in the order of evaluation.
-        objective_names: of the columns of the objectives.
-        seconds: that the search took.
+        objective_names: names of the objectives, in the order of their columns.
+        seconds: duration of the search [s].
     """
 
     evaluations: Evaluations
@@ -53,7 +53,8 @@ class EvaluatedCandidates:
 def _groups(
     n_var: int, objective_names: tuple[str, ...], reasons: tuple[str, ...] = REASONS
 ) -> dict[str, list[str]]:
-    """Return the columns of numbers by the field of `Evaluations` that they hold."""
+    """Return the names of the columns of numbers, by the field of `Evaluations` that they
+    contain."""
     return {
         "x": [f"x_{k + 1}" for k in range(n_var)],
         "objectives": [f"objective_{name}" for name in objective_names],
@@ -71,7 +72,7 @@ def columns(
 
 
 def encode(candidates: EvaluatedCandidates) -> bytes:
-    """Return the content of the file; the same candidates always give the same bytes."""
+    """Return the content of the file. Equal candidates always give equal bytes."""
     found = candidates.evaluations
     words = {FEASIBLE: "", **dict(enumerate(REASONS))}
     width = found.x.shape[1]
@@ -92,8 +93,8 @@ def decode(content: bytes, path: Path) -> EvaluatedCandidates:
     """Read the candidates in a file's content.
 
     Args:
-        content: as from `encode`.
-        path: named in messages.
+        content: content of the file, from `encode`.
+        path: path of the file, for messages.
 
     Raises:
         ResultsError: the content is damaged.
@@ -141,8 +142,8 @@ def _text(line: bytes) -> str:
 def _rows(file: gzip.GzipFile, width: int, most: int) -> tuple[Array, NDArray[np.int8]]:
     """Read the numbers (n, width - 1) and reasons (n,) of all rows.
 
-    Row by row, so that no more is held than what is kept, and a small file cannot unfold into a
-    huge one: each row bears its number, and there are not more than `most` numbers.
+    Rows are read one by one, so memory holds only the result, and a small file cannot expand into a
+    huge one: each row has its number, and there are at most `most` numbers.
     """
     reasons = {"": FEASIBLE, **{reason: k for k, reason in enumerate(REASONS)}}
     numbers, found = array("d"), array("b")

@@ -1,5 +1,5 @@
-"""Execution of a campaign, and its results folder: locked by one process, made from one workcell
-with one set of settings and one version of the software."""
+"""Execution of a campaign, and its results folder. One process locks the folder. It belongs to one
+workcell, one set of settings and one version of the software."""
 
 from __future__ import annotations
 
@@ -49,15 +49,15 @@ ExecutorName = Literal["processes", "dask"]
 
 @dataclass(frozen=True)
 class ExecutionSettings:
-    """Execution of a campaign; nothing here changes its results.
+    """Settings of the execution of a campaign. They do not change its results.
 
     Attributes:
         output: the results folder.
-        jobs: worker processes, 0 for one per core that this process may use.
+        jobs: number of worker processes, 0 for one per core that this process may use.
         executor: 'processes' of this machine, or 'dask' for a cluster.
         scheduler: address of the Dask scheduler, only with 'dask'.
-        resume: continue the study in the results folder.
-        overwrite: remove the study in the results folder, and begin anew.
+        resume: True to continue the study in the results folder.
+        overwrite: True to remove the study in the results folder and begin anew.
     """
 
     output: Path
@@ -71,7 +71,7 @@ class ExecutionSettings:
         """Check every value.
 
         Raises:
-            SettingsError: with the value and the allowed ones.
+            SettingsError: a value is not allowed; the message states the allowed values.
         """
         require_allowed(self)
         if self.resume and self.overwrite:
@@ -84,7 +84,7 @@ class ExecutionSettings:
 
 
 def workers_for(execution: ExecutionSettings) -> Workers:
-    """Return the workers that the execution settings ask for, not started yet."""
+    """Return the workers that the execution settings describe. They are not started yet."""
     if execution.executor == "dask":
         assert execution.scheduler is not None
         return DaskWorkers(execution.scheduler, environment)
@@ -99,7 +99,8 @@ _PACKAGES = ("casadi", "moocore", "numpy", "pin", "pymoo", "python-fcl", "scipy"
 
 @cache
 def environment() -> Mapping[str, str]:
-    """Return by name the software versions that affect a search, and a digest of the sources."""
+    """Return the versions of software that affects a search, and a digest of the sources, by
+    name."""
     versions = {name: version(name) for name in _PACKAGES}
     versions["dual-arm-carry"] = own_version()  # beside the digest of the sources
     versions["sources"] = source_digest("symbolic", "codegen", "hybrid_opt")
@@ -122,7 +123,7 @@ def configuration_of(settings: CampaignSettings, root: Path, workcell: Workcell)
 
 
 def require_equal(stored: Any, wanted: Mapping[str, Any], where: str) -> None:
-    """Raise an error if a stored configuration differs from the current one.
+    """Check that a stored configuration equals the current one.
 
     Args:
         stored: stored JSON values.
@@ -238,11 +239,11 @@ def open_folder(
 
 
 def require_usable(execution: ExecutionSettings) -> None:
-    """Raise an error if the results folder cannot be used.
+    """Check that the results folder can be used.
 
     Raises:
-        ResultsError: the folder holds a campaign without the setting `resume` or `overwrite`, or
-            other files.
+        ResultsError: the folder contains a campaign and neither `resume` nor `overwrite` is set, or
+            it contains other files.
     """
     root = execution.output
     if (root / CONFIGURATION).exists():
@@ -267,8 +268,8 @@ _ELSEWHERE = "choose another --output, or remove those results with --overwrite"
 def _clear(root: Path) -> None:
     """Remove everything in a results folder.
 
-    Marks of finished stages go first and the configuration last: after an interruption at any
-    moment no missing file looks finished, and the folder can be overwritten again.
+    Marks of finished stages are removed first and the configuration last. So after an interruption
+    no missing file seems finished, and the folder can be overwritten again.
     """
     order = {STAGES: 0, CONFIGURATION: 2}
     with storing(root):
@@ -280,7 +281,7 @@ def _clear(root: Path) -> None:
 
 
 def _stored_cell(root: Path, files: CellFiles) -> Workcell:
-    """Return the folder's copy of the workcell, made if it is missing."""
+    """Return the workcell of the folder's copy. The copy is made if it is missing."""
     folder = root / WORKCELL
     if not folder.exists():
         draft = root / f".{WORKCELL}"

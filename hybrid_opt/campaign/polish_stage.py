@@ -1,8 +1,8 @@
 """The stage of a study that polishes its fronts.
 
-Fronts of both peak forces are polished replica by replica. Drivable fronts are polished as one,
-their union: the polish begins with the best of all known paths, so the polished fronts of two
-replicas would share most of their points. A front's file is its `PolishedFront` as JSON.
+Fronts of both peak forces are polished replica by replica. Of drivable fronts only the union is
+polished: a polish begins with the best of all known paths, so the polished fronts of two replicas
+would share most of their points. The file of a front is its `PolishedFront` as JSON.
 """
 
 from __future__ import annotations
@@ -27,15 +27,16 @@ from symbolic.read.cell_files import CellFiles
 
 @dataclass(frozen=True)
 class PolishRequest:
-    """A front to polish.
+    """Request to polish one front.
 
     Attributes:
-        files: of the campaign's cell.
-        settings: the campaign's.
-        polish: those of the polish.
-        algorithm, replica: which one, see `Front.key`.
-        x: (k, n_var) its members.
-        paths: (m, n_path) known beside it.
+        files: files of the campaign's cell.
+        settings: settings of the campaign.
+        polish: settings of the polish.
+        algorithm, replica: name of the algorithm and number of the replica of the front
+            (`Front.key`).
+        x: (k, n_var) members of the front.
+        paths: (m, n_path) further known paths.
     """
 
     files: CellFiles
@@ -48,7 +49,7 @@ class PolishRequest:
 
 
 def polish_front(request: PolishRequest, progress: ShowProgress = False) -> bytes:
-    """Polish one front; returns the content of its file."""
+    """Polish one front. Return the content of its file."""
     use_one_thread()
     settings = request.settings
     done = polish(
@@ -67,7 +68,8 @@ def polish_stage(
     """Return the stage that polishes the fronts of `CampaignResults.to_polish`.
 
     Args:
-        known: paths (m, n_path) that are known beside the fronts; None for none.
+        settings: settings of the polish.
+        known: function of the folder that returns further known paths (m, n_path); None for none.
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
@@ -91,6 +93,7 @@ def polish_stage(
 
 
 def _is_polished(folder: CampaignFolder, front: Front) -> bool:
-    """Return whether a front's polish is there and whole; a damaged one is computed anew."""
+    """Return True if the file of a front's polish exists and is undamaged. A damaged one is
+    computed again."""
     exists = polished_file(folder.root, *front.key).exists()
     return is_whole(exists, lambda: read_polished(folder.root, front))

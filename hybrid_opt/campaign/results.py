@@ -1,7 +1,7 @@
 """Readers of a campaign's results folder, and of all other files of this project.
 
-Nothing stored is executed, and files are compared with the checksums taken when they were
-written. docs/reference/results.md describes the folder.
+Stored content is never executed, and files are compared with the checksums that were taken when
+they were written. docs/reference/results.md describes the folder.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ from symbolic.records import Workcell
 RECOMPUTE_REMEDY = "--resume computes it anew"
 
 CACHED_TABLES = 64
-"""Largest number of decoded tables, and of polished fronts, in memory: stages read them often."""
+"""Largest number of decoded tables, and of polished fronts, in memory. Stages read them often."""
 
 _decoded = lru_cache(maxsize=CACHED_TABLES)(decode)
 _record_of = lru_cache(maxsize=CACHED_TABLES)(record_of)
@@ -126,7 +126,7 @@ class CampaignResults:
 
     @property
     def _figures(self) -> dict[str, str]:
-        """The fronts of each kind, and the file of the carry to run."""
+        """The fronts of each kind, and the file of the recommended carry."""
         sizes: dict[str, list[int]] = {}
         for front in self.fronts:
             sizes.setdefault(front.title, []).append(len(front))
@@ -196,7 +196,7 @@ class CampaignResults:
         return tuple(front for front in (*found, self.polished(UNION)) if front is not None)
 
     def polished(self, algorithm: str, replica: int = 0) -> Front | None:
-        """Return the polished front of a replica or of the union, None without a polish.
+        """Return the polished front of a replica or of the union; None if it was not polished.
 
         Args:
             algorithm: name of the algorithm, or `UNION`.
@@ -300,7 +300,8 @@ def read_replica(root: Path, algorithm: str, number: int, objectives: tuple[str,
 
 
 def is_whole(exists: bool, read: Callable[[], object]) -> bool:
-    """Return True if a stage's result exists and can be read; report damage as a warning.
+    """Return True if the result of a stage exists and can be read. A damaged result is reported as
+    a warning.
 
     Args:
         exists: True if the result exists.
@@ -317,7 +318,7 @@ def is_whole(exists: bool, read: Callable[[], object]) -> bool:
 
 
 def read_polished(root: Path, front: Front) -> PolishedFront | None:
-    """Read the polished front that belongs to a front; return None without a polish.
+    """Read the polished front that belongs to a front; None if it was not polished.
 
     Args:
         root: the results folder.
@@ -344,7 +345,8 @@ def read_polished(root: Path, front: Front) -> PolishedFront | None:
 
 
 _OPENED: list[TemporaryDirectory[str]] = []
-"""What the cells of trajectory files were unpacked into, until the process ends."""
+"""Folders into which the cells of trajectory files were unpacked. They exist until the process
+ends."""
 
 
 def load(path: str | Path) -> Cell | Carry | CampaignResults | Mapping[str, Any]:
@@ -358,7 +360,7 @@ def load(path: str | Path) -> Cell | Carry | CampaignResults | Mapping[str, Any]
         results folder, or the manifest of a bundle (JSON values by name).
 
     Raises:
-        WorkcellError: the workcell file is wrong.
+        WorkcellError: the workcell file is invalid.
         ResultsError: the path is none of these, or the content is damaged.
     """
     path = Path(path)

@@ -1,4 +1,5 @@
-"""The first stage of a study: every algorithm's replicas, spread over the workers."""
+"""The first stage of a study: the searches of every algorithm's replicas, spread over the
+workers."""
 
 from __future__ import annotations
 
@@ -21,12 +22,12 @@ from symbolic.read.cell_files import CellFiles
 
 @dataclass(frozen=True)
 class SearchRequest:
-    """A replica to search.
+    """Request to search one replica.
 
     Attributes:
-        files: of the campaign's cell.
-        settings: the campaign's.
-        algorithm, replica: which one.
+        files: files of the campaign's cell.
+        settings: settings of the campaign.
+        algorithm, replica: name of the algorithm and number of the replica.
     """
 
     files: CellFiles
@@ -36,7 +37,7 @@ class SearchRequest:
 
 
 def search_replica(request: SearchRequest, progress: ShowProgress = False) -> bytes:
-    """Search one replica from its seed; returns the content of its file."""
+    """Search one replica from its seed. Return the content of its file."""
     settings, algorithm = request.settings, request.algorithm
     cell = loaded_cell(request.files, settings.objectives)
     # None: the hand-made trajectory.
@@ -60,7 +61,7 @@ def search_stage(function: ReplicaFunction[SearchRequest] = search_replica) -> S
     """Return the stage that searches all replicas.
 
     Args:
-        function: searches one.
+        function: function that searches one replica.
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
@@ -80,16 +81,15 @@ def search_stage(function: ReplicaFunction[SearchRequest] = search_replica) -> S
 
 
 def _is_done(folder: CampaignFolder, key: tuple[str, int]) -> bool:
-    """Return whether a replica's file is there and whole; a damaged one is searched anew, which
-    gives the same bits."""
+    """Return True if the file of a replica exists and is undamaged. A damaged replica is searched
+    again, with the same bits as result."""
     exists = replica_file(folder.root, *key).exists()
     objectives = folder.settings.objectives
     return is_whole(exists, lambda: read_replica(folder.root, *key, objectives))
 
 
 def _replicas(folder: CampaignFolder) -> dict[tuple[str, int], Path]:
-    """Return the file of every replica; replica by replica, so that an early look finds all
-    algorithms."""
+    """Return the file of every replica, ordered by number. So every algorithm has results early."""
     settings = folder.settings
     return {
         (algorithm, replica): replica_file(folder.root, algorithm, replica)

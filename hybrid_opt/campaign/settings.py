@@ -1,5 +1,5 @@
 """Settings of a campaign and the source of its randomness; the small files of its results folder as
-records, and where they lie (docs/reference/results.md)."""
+records, and their paths (docs/reference/results.md)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,8 @@ from symbolic.array import Range, require_allowed
 from symbolic.errors import SettingsError
 
 FirstGeneration = Literal["initial", "random"]
-"""'random': all candidates uniformly random; 'initial': one is the hand-made trajectory."""
+"""'random': all candidates are uniformly random. 'initial': one of them is the hand-made
+trajectory."""
 
 Budget = Annotated[int, Range(1, 10**9)]
 Runs = Annotated[int, Range(1, 10_000)]
@@ -40,14 +41,14 @@ def sized(algorithm: str, size: int) -> dict[str, Any]:
 def chosen(
     names: Sequence[str], populations: Sequence[tuple[str, int]] = ()
 ) -> dict[str, dict[str, Any]]:
-    """Return the algorithms of a campaign with their non-default settings.
+    """Return the algorithms of a campaign with the settings that differ from the defaults.
 
     Args:
         names: names of search algorithms in `hybrid_opt.metaheuristics`, each once.
-        populations: (algorithm, candidates per generation), each algorithm at most once.
+        populations: pairs of algorithm and candidates per generation, each algorithm at most once.
 
     Raises:
-        SettingsError: a name is missing, unknown or there twice.
+        SettingsError: a name is missing, unknown or given twice.
     """
     if not names or len(set(names)) != len(names):
         raise SettingsError(
@@ -64,14 +65,14 @@ def chosen(
 
 @dataclass(frozen=True)
 class CampaignSettings:
-    """Everything that decides a campaign's results, besides the workcell.
+    """Everything that determines the results of a campaign, apart from the workcell.
 
     Attributes:
         algorithms: settings of each algorithm by algorithm name (`hybrid_opt.metaheuristics`);
             missing settings get their defaults.
         evaluations: number of candidates that every replica evaluates.
-        replicas: independent runs per algorithm.
-        seed: the campaign's seed; every replica derives its own from it.
+        replicas: number of independent runs per algorithm.
+        seed: seed of the campaign, from which every replica derives its own.
         objectives: names of objectives in `hybrid_opt.evaluate.objectives`, each once.
         constraint_handling: 'penalty' (the paper's) or 'constraints'.
         first_generation: candidates at the start of a search, 'initial' or 'random'; the random
@@ -87,10 +88,10 @@ class CampaignSettings:
     first_generation: FirstGeneration = "initial"
 
     def __post_init__(self) -> None:
-        """Check every value and fill in the algorithms' settings.
+        """Check every value, and add the defaults of the algorithms' settings.
 
         Raises:
-            SettingsError: with the value and the allowed ones.
+            SettingsError: a value is not allowed; the message states the allowed values.
         """
         require_allowed(self)
         select_objectives(self.objectives)
@@ -103,14 +104,15 @@ class CampaignSettings:
         object.__setattr__(self, "algorithms", whole)
 
     def starts_from_initial(self, algorithm: str) -> bool:
-        """Return True if an algorithm's first generation holds the hand-made trajectory."""
+        """Return True if the first generation of an algorithm contains the hand-made trajectory."""
         return self.first_generation == "initial" and algorithm != "random"
 
     def replica_rng(self, algorithm: str, replica: int) -> np.random.Generator:
-        """Return the only source of randomness of one replica.
+        """Return the random generator of one replica, its only source of randomness.
 
-        It depends on the campaign's seed, the algorithm's name and the replica's number alone:
-        not on other algorithms, on the number of replicas, or on the order of work.
+        The generator depends only on the campaign's seed, the algorithm's name and the replica's
+        number. It does not depend on other algorithms, the number of replicas, or the order of
+        work.
         """
         key = (zlib.crc32(algorithm.encode()), replica)
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=key))
@@ -138,7 +140,7 @@ class StoredCell:
 
 @dataclass(frozen=True)
 class Configuration:
-    """Content of configuration.json: everything that decides the results of a campaign."""
+    """Content of configuration.json: everything that determines the results of a campaign."""
 
     format: str
     version: int

@@ -1,11 +1,10 @@
-"""Stages of a study, each run once and marked as done; its cells as values for any process or
-machine; and the parallel build of everything that it compiles.
+"""Stages of a study, each run once and marked as done; cells as values for any process or machine;
+and the parallel build of all compiled functions.
 
-A stage reads what earlier stages left in the results folder and writes files of its own. Its
-marker, `stages/NAME.json`, is written when it begins and again when it is done. If a marker is
-missing or does not say 'done', or files of the stage are damaged, it runs (again), so a stage that
-takes long keeps what it achieved in files of its own and continues from them. When a stage runs,
-all later ones do too.
+A stage reads the results of earlier stages in the results folder and writes files of its own. Its
+marker, `stages/NAME.json`, is written when the stage begins and again when it is done. A stage runs
+again if its marker is missing or does not say 'done', or if its files are damaged. A long stage
+continues from files that it has already written. When a stage runs, all later stages run too.
 """
 
 from __future__ import annotations
@@ -61,10 +60,12 @@ class Stage:
     """One step of a study.
 
     Attributes:
-        name: unique; names its marker.
-        run: does it.
-        settings: what decides its results besides the campaign, as JSON values.
-        whole: returns True if its results are there and undamaged; called once it is done.
+        name: unique name, also of the stage's marker.
+        run: function that does the work of the stage.
+        settings: settings that determine the stage's results, in addition to the campaign's, as
+            JSON values.
+        whole: function that returns True if the results exist and are undamaged; it is called for a
+            stage that is done.
     """
 
     name: str
@@ -74,11 +75,11 @@ class Stage:
 
 
 def run_stages(folder: CampaignFolder, stages: Sequence[Stage], progress: Progress) -> None:
-    """Run the stages that are not done yet, or whose files were damaged since, in order.
+    """Run the stages, in order, that are not done yet or whose files were damaged since.
 
     Raises:
         ResultsError: a stage began with other settings.
-        DualArmError: as of a stage.
+        DualArmError: a stage failed.
     """
     check_stages(folder, stages)
     for number, stage in enumerate(stages):
@@ -121,10 +122,10 @@ def _mark(folder: CampaignFolder, stage: Stage, status: StageStatus, seconds: fl
 
 
 def check_stages(folder: CampaignFolder, stages: Sequence[Stage]) -> None:
-    """Refuse stages that began with other settings, before any work.
+    """Check, before any work, that no stage began with other settings.
 
     Raises:
-        ResultsError: one did.
+        ResultsError: a stage began with other settings.
     """
     for stage in stages:
         marker = _marker(folder, stage)
@@ -138,19 +139,22 @@ def check_stages(folder: CampaignFolder, stages: Sequence[Stage]) -> None:
 
 
 DRIVABLE_REPLICAS = 3
-"""Most replicas per algorithm of a drivable experiment beside another one: it answers one question,
-which carry to run, and its replicas' fronts differ by about one per cent."""
+"""Largest number of replicas per algorithm of a drivable experiment beside another one. It answers
+one question, which carry to run, and the fronts of its replicas differ by about one per cent."""
 
 
 def drivable_settings(settings: CampaignSettings, replicas: int | None = None) -> CampaignSettings:
-    """Return the settings of the drivable experiment beside another one: the same except the
-    objectives, durations and forces of the kind that the other one minimises, and the replicas.
+    """Return the settings of the drivable experiment beside another experiment.
+
+    They differ only in the objectives, which are durations and forces of the kind that the other
+    experiment minimises, and in the replicas.
 
     Args:
-        replicas: per algorithm; None for as many, at most `DRIVABLE_REPLICAS`.
+        settings: settings of the other experiment.
+        replicas: number of replicas per algorithm; None for as many, at most `DRIVABLE_REPLICAS`.
 
     Raises:
-        SettingsError: there are none, or too many.
+        SettingsError: the number of replicas is not allowed.
     """
     if replicas is None:
         replicas = min(settings.replicas, DRIVABLE_REPLICAS)
@@ -161,11 +165,12 @@ def drivable_settings(settings: CampaignSettings, replicas: int | None = None) -
 def drivable_stage(stages: Sequence[Stage], replicas: int | None = None) -> Stage:
     """Return the stage that searches for drivable carries, in the folder `drivable/`.
 
-    The folder is a campaign like any other, of the drivable variant of the study's cell.
+    The folder contains a complete campaign of the drivable variant of the study's cell.
 
     Args:
         stages: stages of that campaign.
-        replicas: as for `drivable_settings`.
+        replicas: number of replicas per algorithm; None for as many as the study, at most
+            `DRIVABLE_REPLICAS`.
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
@@ -185,19 +190,20 @@ def drivable_stage(stages: Sequence[Stage], replicas: int | None = None) -> Stag
 _ANEW = "start the study anew"
 
 COMPETITION_REPLICAS = 2
-"""The competition may spend as many evaluations as this many replicas."""
+"""A competition of start branches may use as many evaluations as so many replicas."""
 
 
 def decided_cell(
     workcell: Workcell, settings: CampaignSettings, execution: ExecutionSettings
 ) -> tuple[Workcell, BranchCompetition | None]:
-    """Return the workcell with its start branches decided, and the competition; None if its file
-    decides them.
+    """Return the workcell with decided start branches, and the competition that decided them; None
+    if the workcell's file states them.
 
-    A campaign that is continued keeps the decision that it began with.
+    A campaign that is continued keeps its first decision.
 
     Raises:
-        DualArmError: no pair of branches holds any trajectory, or the stored decision is damaged.
+        DualArmError: no pair of branches can carry the box on any trajectory, or the stored
+            decision is damaged.
     """
     if SEARCHED_BRANCH not in workcell.start_branch:
         return workcell, None
@@ -213,8 +219,8 @@ def decided_cell(
 
 
 def read_branches(root: Path) -> BranchCompetition | None:
-    """Read the decision on the start branches of a study in a results folder; None if its workcell
-    decides them.
+    """Read the decision on a study's start branches from a results folder; None if the workcell's
+    file states them.
 
     Raises:
         ResultsError: the stored decision is damaged.
@@ -224,7 +230,8 @@ def read_branches(root: Path) -> BranchCompetition | None:
 
 
 def store_branches(root: Path, competition: BranchCompetition | None) -> str:
-    """Store a decision in a results folder; return its text to print, '' without one."""
+    """Store a decision on start branches in a results folder. Return its text for the terminal; ''
+    for None."""
     if competition is None:
         return ""
     write_json(root / BRANCHES, to_json(competition))
@@ -236,10 +243,16 @@ ArgumentIn = TypeVar("ArgumentIn", contravariant=True)
 
 
 class ReplicaFunction(Protocol[ArgumentIn]):
-    """Computes the content of a replica's file in any process."""
+    """Function that computes the content of a replica's file in any process."""
 
     def __call__(self, argument: ArgumentIn, progress: ShowProgress = False, /) -> bytes:
-        """Return the content; `progress` as in `hybrid_opt.search`."""
+        """Return the content of the file.
+
+        Args:
+            argument: request for one replica.
+            progress: True for a progress bar, or a function of the finished and the total number of
+                units.
+        """
 
 
 def store_results(
@@ -250,15 +263,17 @@ def store_results(
     left: Mapping[Path, Argument],
     done: int,
 ) -> None:
-    """Have the workers compute the missing files, and store each when it is done.
+    """Compute missing files by the workers, and store each when it is finished.
 
-    The only file of a stage is computed in this process, which sees its progress.
+    If a stage has only one file, this process computes it and shows its progress.
 
     Args:
-        stage: title of the work, the unit of its progress, and units in each file.
-        function: returns the content of a file.
-        left: its argument for each file that is missing.
-        done: files that are there.
+        folder: the results folder.
+        progress: display of progress.
+        stage: title of the work, unit of its progress, and number of units per file.
+        function: function that returns the content of a file.
+        left: argument of the function for each missing file.
+        done: number of files that already exist.
     """
     title, unit, each = stage
     paths = list(left)
@@ -279,9 +294,9 @@ def store_results(
 
 @lru_cache(maxsize=2)
 def loaded_cell(files: CellFiles, objectives: tuple[str, ...]) -> Cell:
-    """Return a cell with these files; a process caches the last ones.
+    """Return the cell with these files. Each process caches the last cells.
 
-    One thread evaluates its candidates: workers share the cores.
+    One thread evaluates its candidates, since workers share the cores.
     """
     return Cell.from_files(files, objectives, threads=1)
 
@@ -290,19 +305,19 @@ Made = TypeVar("Made")
 
 
 def with_cell(of_workcell: Callable[[Workcell], Made], files: CellFiles) -> Made:
-    """Return the result of a function of a stored workcell, whose files exist only during the
-    call."""
+    """Return the result of a function of a stored workcell. The files of the workcell exist only
+    during the call."""
     with TemporaryDirectory() as folder:
         return of_workcell(unpack_cell(files, Path(folder)))
 
 
 @dataclass(frozen=True)
 class ReadyCell:
-    """A cell with everything loaded that evaluates, times and plans its carries.
+    """A cell with everything loaded that its carries need: evaluation, timing and jobs.
 
     Attributes:
         cell: the cell.
-        jobs: plans its jobs; `jobs.timing` times its paths.
+        jobs: planner of its jobs; `jobs.timing` times its paths.
     """
 
     cell: Cell
@@ -310,7 +325,8 @@ class ReadyCell:
 
     @classmethod
     def of(cls, objectives: tuple[str, ...], workcell: Workcell) -> ReadyCell:
-        """Load everything that is loaded on first use, since the cell's files exist only now."""
+        """Load a cell with everything that is otherwise loaded on first use, since the cell's files
+        exist only now."""
         # Not imported at the top: other stages time nothing.
         from hybrid_opt.timing.path_timer import search_carry, search_timing
 
@@ -323,14 +339,16 @@ class ReadyCell:
 
 
 Cells = tuple[tuple[CellFiles, tuple[str, ...]], ...]
-"""Files of cells, each with its objectives; the last one is the cell that robots drive."""
+"""Files of cells, each with its objectives. The last one is the drivable cell."""
 
 
 def cells_of(files: CellFiles, objectives: tuple[str, ...], driven: bool) -> Cells:
-    """Return an experiment's own cell, and its drivable variant, whose contact model may differ.
+    """Return an experiment's cell and its drivable variant, whose contact model may differ.
 
     Args:
-        driven: whether robots drive the experiment's own cell.
+        files: files of the experiment's cell.
+        objectives: objectives of the experiment.
+        driven: True if the experiment's cell is already drivable.
     """
     own = (files, objectives)
     if driven:
@@ -340,30 +358,31 @@ def cells_of(files: CellFiles, objectives: tuple[str, ...], driven: bool) -> Cel
 
 @lru_cache(maxsize=1)
 def ready_cells(cells: Cells) -> tuple[ReadyCell, ...]:
-    """Load the cells' compiled functions, or build missing ones; a process caches the last ones."""
+    """Load the compiled functions of cells, or build missing ones. Each process caches the last
+    cells."""
     return tuple(with_cell(partial(ReadyCell.of, names), files) for files, names in cells)
 
 
 # --- what is compiled ---
 
 Maker = Callable[[], object]
-"""Loads or builds functions."""
+"""Function that loads or builds compiled functions."""
 
 _ELAPSED_INTERVAL = 1.0
-"""Interval at which the elapsed time is shown [s]."""
+"""Interval at which the display of elapsed time is updated [s]."""
 
 
 def build_study(cell: Cell, progress: Progress, polish: bool = True, drivable: bool = True) -> None:
-    """Load or build the functions of a study, with all compilers in parallel.
+    """Load or build the compiled functions of a study, with compilers in parallel.
 
-    Rows of arms' clearances are compiled later, by the solves of a polish. A failed build is
-    reported by the first caller of its functions.
+    Rows of arms' clearances are compiled later, during a polish. The first caller of functions that
+    could not be built reports the failure.
 
     Args:
-        cell: read from a file.
-        progress: where to show it.
+        cell: a cell that was read from a file.
+        progress: display of progress.
         polish: whether fronts are polished.
-        drivable: whether carries are also searched for as robots drive them.
+        drivable: whether drivable carries are searched too.
     """
     cache = cell.compiled.cache or Cache()
     what = (str(cell.force_kind), str(polish), str(drivable), compiler_of(cache).identity)
@@ -381,13 +400,14 @@ def build_study(cell: Cell, progress: Progress, polish: bool = True, drivable: b
 
 
 def build_all(makers: Sequence[Maker], progress: Progress) -> list[DualArmError]:
-    """Load or build functions in parallel; a failed build is left to its first caller.
+    """Load or build functions in parallel. The first caller of functions that could not be built
+    reports the failure.
 
-    Ctrl-C ends all compilers and loses nothing that is compiled; the threads that make expressions
-    are not waited for.
+    Ctrl-C ends all compilers. Finished libraries are kept; threads that build expressions are not
+    waited for.
 
     Returns:
-        Why some were not built.
+        Errors of failed builds.
     """
     # Each waits for its compilers most of the time; expressions are made by one after the other.
     pool = ThreadPoolExecutor(len(makers))

@@ -1,1 +1,1 @@
-"""The work of the programs, apart from their options; imported when they run."""
+"""The work of the programs, apart from their options. It is imported when a program runs."""

@@ -1,4 +1,4 @@
-"""Two campaigns beside one another, for `dual-arm-carry compare`."""
+"""Comparison of two campaigns, for `dual-arm-carry compare`."""
 
 from __future__ import annotations
 
@@ -29,10 +29,10 @@ from studies.study.tables import REPLICA_QUANTITIES
 from symbolic.array import Array
 
 RECOMPUTED_FIGURES = ("non_dominated", "hypervolume", "igd", "spacing")
-"""Figures of fronts, computed anew with the reference front of both campaigns."""
+"""Figures of fronts that are computed again with the reference front of both campaigns."""
 
 STORED = ("feasible_share", "mean_excess_above_static", "payload_limit", "seconds")
-"""Figures taken from summary.json."""
+"""Figures that are taken from summary.json."""
 
 POLISHED_PREFIX = "polished_"
 """Prefix of the figures of polished fronts."""
@@ -43,9 +43,10 @@ class ComparedFigure:
     """One figure of one algorithm in both campaigns.
 
     Attributes:
-        algorithm, figure: which one.
-        first, second: its summary over each campaign's replicas.
-        test: rank test between them, None with few replicas or where one of them has no value.
+        algorithm, figure: names of the algorithm and of the figure.
+        first, second: summary of the figure over the replicas of each campaign.
+        test: rank test between both campaigns; None for few replicas, or if one campaign has no
+            value.
     """
 
     algorithm: str
@@ -57,16 +58,16 @@ class ComparedFigure:
 
 @dataclass(frozen=True)
 class CampaignComparison:
-    """Two campaigns beside one another.
+    """Comparison of two campaigns.
 
     Attributes:
-        runs: the two folders.
-        same_workcell: whether both searched the same cell; figures of different cells say
+        runs: the two results folders.
+        same_workcell: whether both campaigns searched the same cell. Figures of different cells say
             little about the algorithms.
-        differences: configuration key, first and second value.
-        figures: of the algorithms that both ran.
-        only: per campaign the algorithms that the other lacks.
-        drivable: their drivable experiments, None where one has none beside its first.
+        differences: key of the configuration, first and second value.
+        figures: compared figures of the algorithms that both campaigns ran.
+        only: for each campaign the algorithms that the other lacks.
+        drivable: comparison of the drivable experiments; None if one campaign has no separate one.
     """
 
     runs: tuple[str, str]
@@ -134,7 +135,8 @@ def _algorithm_figures(
 def _values(
     run: CampaignResults, name: str, summary: CampaignSummary, reference: Array
 ) -> dict[str, list[float]]:
-    """Return an algorithm's figures by name, one per replica, those of polished fronts last."""
+    """Return the figures of an algorithm by name, one value per replica; figures of polished fronts
+    come last."""
     stored = summary.algorithms[name].replicas
     better = [row.polished for row in stored if row.polished is not None]
     values: dict[str, list[float]] = {}
@@ -157,7 +159,7 @@ def _compared(name: str, figure: str, first: Array, second: Array) -> ComparedFi
 
 
 def _with_holm(figures: list[ComparedFigure]) -> tuple[ComparedFigure, ...]:
-    """Return the figures with their tests corrected as one family."""
+    """Return the figures with their tests corrected as one family (Holm)."""
     tests = iter(corrected([figure.test for figure in figures if figure.test is not None]))
     return tuple(
         figure if figure.test is None else replace(figure, test=next(tests)) for figure in figures
@@ -212,7 +214,8 @@ def _quantity(figure: str) -> tuple[str, Quantity]:
 
 
 def compare_folders(options: argparse.Namespace) -> int:
-    """Compare the two results folders of the options, and print it; returns the exit code."""
+    """Compare the two results folders in the options, and print the comparison. Return the exit
+    code."""
     found = compare(options.run_a, options.run_b)
     print(json.dumps(to_json(found), indent=2) if options.json else as_text(found))
     return 0

@@ -28,21 +28,21 @@ from symbolic.records.task import straight_line
 from symbolic.robot.branches import StartBranch
 
 EXPLAINED = 100
-"""Most infeasible candidates that are looked at closer."""
+"""Largest number of infeasible candidates that are examined."""
 
 SHORT_POLISH_ATTEMPTS = 10
-"""Solves of the short polish: the trajectory itself, then ends, middle and gaps of what it
-becomes."""
+"""Number of attempts of the short polish: first the trajectory itself, then ends, middle and gaps
+of the resulting front."""
 
 
 @dataclass(frozen=True)
 class Optimum:
-    """Outcome of a short polish of the hand-made trajectory.
+    """Result of a short polish of the hand-made trajectory.
 
     Attributes:
-        solutions: of the polished front.
-        binding: the bounds that they lie on.
-        problem: why there is no polish, '' where there is one.
+        solutions: number of solutions of the polished front.
+        binding: bounds that solutions lie on.
+        problem: reason why there is no polish, else ''.
     """
 
     solutions: int
@@ -65,11 +65,12 @@ def inspected(
 
     Args:
         candidates: number of random candidates, at least 1.
-        seed: of their randomness.
-        output: folder for the pictures, None to draw none.
-        polish: polish the hand-made trajectory briefly, to find active bounds.
-        view: file for a page that shows the hand-made trajectory, None for none.
-        pairs: list every pair of bodies.
+        workcell: the cell.
+        seed: seed of the random candidates.
+        output: folder for the pictures; None to draw none.
+        polish: True to polish the hand-made trajectory briefly, to find active bounds.
+        view: file for a page that shows the hand-made trajectory; None for none.
+        pairs: True to list every pair of bodies.
 
     Raises:
         DualArmError: the model cannot be built, or a picture cannot be written.
@@ -128,7 +129,7 @@ def inspected(
 
 
 def _at_rest(cell: Cell) -> ProgramResult:
-    """Compute the forces of holding the payload level and still, and whether it can be held."""
+    """Compute the forces that hold the payload level and at rest, and whether it can be held."""
     hold, static_hold_error = cell.static_hold, cell.static_hold_error
     force = hold.normal_force
     share = force / cell.workcell.task.reference_force
@@ -153,7 +154,7 @@ def _at_rest(cell: Cell) -> ProgramResult:
 
 
 def _postures(cell: Cell) -> ProgramResult:
-    """Return the postures at the start per robot's name, best first."""
+    """Return the postures at the start by robot, best first."""
     robots = cell.workcell.robots
     found = cell.compiled.model.branches
     branches = {
@@ -168,7 +169,8 @@ def _postures(cell: Cell) -> ProgramResult:
 
 
 def _candidates(cell: Cell, count: int, seed: int) -> Iterator[ProgramResult]:
-    """Evaluate random candidates: the number of feasible ones, and the obstacles of the others."""
+    """Evaluate random candidates. Yield the number of feasible ones, and the obstacles of the
+    others."""
     found = cell.evaluate(cell.random(count, np.random.default_rng(seed)))
     share, reasons = float(found.feasible.mean()), found.infeasible_by_reason
     lines = [
@@ -193,7 +195,7 @@ def _candidates(cell: Cell, count: int, seed: int) -> Iterator[ProgramResult]:
 
 
 def _meshes(workcell: Workcell) -> ProgramResult:
-    """Return sizes of the meshes as read, and of their convex pieces, by file."""
+    """Return the sizes of the meshes, and of their convex pieces, by file."""
     reader = MeshReader()
     collision_bodies(workcell, reader)
     sizes = {
@@ -214,7 +216,7 @@ def _meshes(workcell: Workcell) -> ProgramResult:
 
 
 def _pairs(cell: Cell, listed: bool) -> ProgramResult:
-    """List the pairs of bodies that are checked, and the others with reasons."""
+    """Return the pairs of bodies that are checked, and the others with the reasons."""
     geometry = cell.geometry
     names, active = [body.name for body in geometry.bodies], geometry.pair_names
     excluded = tuple((names[p.first], names[p.second], p.reason) for p in geometry.excluded)
@@ -230,7 +232,8 @@ def _pairs(cell: Cell, listed: bool) -> ProgramResult:
 
 
 def _optimum(cell: Cell, progress: Progress) -> Optimum:
-    """Polish the hand-made trajectory briefly; return the result and the bounds that bind there."""
+    """Polish the hand-made trajectory briefly. Return the result and the bounds that its solutions
+    lie on."""
     verdicts = cell.evaluate(cell.initial)
     if not verdicts.feasible.all():
         return Optimum(0, (), "the hand-made trajectory, its start, is infeasible")
@@ -275,10 +278,13 @@ def _vector(values: Array) -> str:
 
 @dataclass(frozen=True)
 class Branch:
-    """A posture of one arm at the start and the least margins of the hand-made trajectory from
-    there; see `symbolic.robot.branches.StartBranch`. The clearance is measured by FCL, 0 where
-    bodies intersect and None where nothing can collide. Joints that slide are in mm, others in deg;
-    `limit_margins` holds the least distance to a limit of either kind by its unit."""
+    """A posture of one arm at the start, with the least margins of the hand-made trajectory from
+    this posture (`symbolic.robot.branches.StartBranch`).
+
+    The clearance is measured by FCL; it is 0 if bodies intersect and None if nothing can collide.
+    Sliding joints are in mm, others in degrees; `limit_margins` has the least distance to a limit
+    of either kind by its unit.
+    """
 
     joints: tuple[float, ...]
     joint_units: tuple[str, ...]
@@ -309,8 +315,8 @@ def _branch(cell: Cell, arm: int, branch: StartBranch) -> Branch:
 
 
 def _clearance_mm(cell: Cell, arm: int, branch: StartBranch) -> float | None:
-    """Measure the least distance of one arm from all other bodies along the samples that it keeps,
-    by FCL."""
+    """Measure the least distance of one arm from all other bodies [mm] along the samples that it
+    keeps, by FCL."""
     checker, kept = cell.evaluator.checker, max(branch.kept, 1)
     own = own_pairs(cell.geometry, arm)
     if not own:
@@ -330,8 +336,17 @@ def draw(
     explained: Mapping[str, Explanation],
     output: Path,
 ) -> tuple[str, ...]:
-    """Draw the paper's Figures 4 and 5 as files in a folder, and the first collision of each carry
-    that fails, by its name; 'initial' is among them. Return the files' names.
+    """Draw the paper's Figures 4 and 5 into a folder, and the first collision of each carry that
+    fails.
+
+    Args:
+        cell: the cell.
+        carries: carries by name; 'initial' is among them.
+        explained: first failure of each carry that fails, by name.
+        output: the folder.
+
+    Returns:
+        Names of the files.
 
     Raises:
         SettingsError: the folder cannot be made.
@@ -357,12 +372,15 @@ def draw(
 
 
 def show(carry: Carry, why: Explanation | None, path: Path) -> str:
-    """Write the page that plays a carry; it begins where the carry fails, the bodies that meet
-    there in red. Its name.
+    """Write the page that plays a carry. It begins at the first failure, with the colliding bodies
+    in red.
+
+    Returns:
+        Name of the file.
 
     Raises:
-        SettingsError: its folder cannot be made.
-        DisplayError: it cannot be written.
+        SettingsError: the folder of the file cannot be made.
+        DisplayError: the file cannot be written.
     """
     from hybrid_opt.display.scene import CarryView, Look
 
@@ -385,7 +403,7 @@ _IN_THE_WAY = {
     "reach": "Robots that do not reach first",
 }
 MOST_TOLD = 10
-"""Most obstacles that are listed."""
+"""Largest number of obstacles that are listed."""
 
 
 def _optimum_lines(optimum: Optimum) -> list[str]:
@@ -421,10 +439,10 @@ def _judged_text(judgement: Judgement) -> str:
 
 
 def inspect(options: argparse.Namespace) -> int:
-    """Inspect the workcell that the options name, and print the findings; return the exit code.
+    """Inspect the workcell in the options, and print the findings. Return the exit code.
 
     Raises:
-        DualArmError: the workcell is wrong, or a picture cannot be written.
+        DualArmError: the workcell is invalid, or a picture cannot be written.
     """
     output = options.output
     findings = inspected(

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def regenerate(options: argparse.Namespace) -> int:
-    """Generate, compile and check as the options state; return the exit code."""
+    """Generate, compile and check functions as the options state. Return the exit code."""
     cache, found = Cache(), list[Agreement]()
     print_findings(_regenerated(cache, options, found), options.json)
     return 0 if all(comparison.agrees for comparison in found) else FAULT
@@ -32,7 +32,7 @@ def regenerate(options: argparse.Namespace) -> int:
 def _regenerated(
     cache: Cache, options: argparse.Namespace, found: list[Agreement]
 ) -> Iterator[ProgramResult]:
-    """Yield one finding per action; comparisons are added to `found`.
+    """Yield one result per action. Comparisons are added to `found`.
 
     The workcell is read and its expressions are made before `--clean` removes anything.
     """
@@ -62,11 +62,11 @@ def _regenerated(
 
 
 FunctionSets: TypeAlias = "list[tuple[Mapping[str, ca.Function], str]]"
-"""Functions by name, and the key of their set."""
+"""Functions by name, with the key of their set."""
 
 
 def _function_sets(cell: CompiledCell) -> FunctionSets:
-    """Make the expressions of the evaluator."""
+    """Build the expressions of the evaluator."""
     from symbolic.functions import arm_functions
 
     symbols = cell.symbols
@@ -77,7 +77,7 @@ def _function_sets(cell: CompiledCell) -> FunctionSets:
 
 
 def _build_study(workcell: Workcell) -> float:
-    """Build all that a study compiles; returns the seconds that it took."""
+    """Build everything that a study compiles. Return the time that it took [s]."""
     from hybrid_opt.campaign.stages import build_study
     from hybrid_opt.cell import Cell
     from hybrid_opt.progress import Progress

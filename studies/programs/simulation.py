@@ -1,4 +1,4 @@
-"""Simulation of a stored trajectory with its controllers or with pads alone, for
+"""Simulation of a stored trajectory with controlled arms or with pads alone, for
 `studies.simulate`."""
 
 from __future__ import annotations
@@ -69,11 +69,12 @@ from symbolic.records import Workcell
 def simulate_arms(
     cell: Cell, carry: Carry, settings: ArmSettings, options: argparse.Namespace
 ) -> str:
-    """Find the threshold of a carry, simulate random cases, and print both; return the cell as
+    """Find the threshold of a carry, simulate random cases, and print both. Return the cell as
     MJCF.
 
     Raises:
-        SimulationError: with --sweep, the box holds at the lower or slips at the upper factor.
+        SimulationError: with --sweep, the box holds at the lower factor or slips at the upper
+            factor.
     """
     control, leader, workcell = options.controller, options.leader - 1, cell.workcell
     witness = CellSimulation(workcell, settings)
@@ -151,20 +152,21 @@ def _film(cell: Cell, outcome: ArmOutcome, path: Path) -> None:
 
 
 PAD_BISECTIONS = 9
-"""Bisections of the factor of pads without arms, to about 0.1 %."""
+"""Number of bisections of the factor for pads without arms, to about 0.1 %."""
 
 CREEP_FACTOR = 1.05
 
 USUAL_CONTROLLER: Control = "leader"
 
 HANDS_LOW = 0.5
-"""Factor at which hands are expected to lose the payload: others take over what one cannot hold."""
+"""Factor at which hands should lose the payload; other hands take over the share of one that
+slips."""
 
 
 def simulate_pads(
     cell: Cell, carry: Carry, settings: SimulationSettings, options: argparse.Namespace
 ) -> None:
-    """Find the threshold of a carry, its creep, simulate random cases, and print them."""
+    """Find the threshold of a carry and its creep, simulate random cases, and print the results."""
     leader, workcell = options.leader - 1, cell.workcell
     moments = planned_moments(cell, carry) if settings.pads == "driven" else None
     witness = BoxSimulation(workcell, settings)
@@ -237,7 +239,7 @@ def simulate_hands(
 
 
 def _swept(step: float) -> tuple[float, float]:
-    """Simulate with half and twice the time step, as far as this can be simulated."""
+    """Return half and twice the time step [s], the latter at most `LARGEST_TIME_STEP`."""
     return step / 2.0, min(2.0 * step, LARGEST_TIME_STEP)
 
 
@@ -248,8 +250,8 @@ def _tell_sweep(step: float, threshold: Threshold[AnyOutcome]) -> None:
 def _tell_worst(
     pressed: Callable[[float], Outcome], planned: Callable[[], Outcome], workcell: Workcell
 ) -> None:
-    """Print the outcome of a box between pads with the least friction: pressed with the least
-    commanded force, and with its least forces."""
+    """Print how a box between pads with the least friction behaves, pressed with the least
+    commanded force and with its least forces."""
     tracked = 1.0 - workcell.uncertainty.tracking
     outcome = pressed(tracked)
     print(
@@ -272,19 +274,19 @@ def threshold_text(threshold: Threshold[AnyOutcome], slip: float) -> str:
 
 
 def _moment(time: float) -> str:
-    """Format a time of a simulation, which presses before the carry."""
+    """Format a time of a simulation; negative times are before the carry, while the pads press."""
     return f"{-time:.3f} s before the carry" if time < 0.0 else f"at {time:.3f} s"
 
 
 def worst_friction(workcell: Workcell) -> Workcell:
-    """Return the nominal case with the set's worst friction."""
+    """Return the workcell with the worst friction of its uncertainty, otherwise nominal."""
     case = nominal_case(workcell)
     case[0:2] *= 1.0 - workcell.uncertainty.friction
     return workcell_of_case(workcell, case)
 
 
 def simulate_file(options: argparse.Namespace) -> int:
-    """Drive a trajectory file in the simulator and print what happens; returns the exit code."""
+    """Simulate a trajectory file and print the results. Return the exit code."""
     pads: Pads = "driven" if options.controller == PADS_DRIVEN else "even"
     settings = SimulationSettings(options.time_step, pads=pads)
     period = max(options.time_step, ArmSettings.control_period)
@@ -322,10 +324,10 @@ def simulate_file(options: argparse.Namespace) -> int:
 
 
 def _controller(workcell: Workcell, options: argparse.Namespace) -> str:
-    """Return the controller to simulate; by default what fits the cell.
+    """Return the controller to simulate, by default one that suits the cell.
 
     Raises:
-        SimulationError: the one that is asked for does not fit.
+        SimulationError: the requested controller does not suit the cell.
     """
     model, chosen = contact_model(workcell), options.controller
     usual = USUAL_CONTROLLER if model.is_squeeze else HANDS
@@ -346,7 +348,7 @@ def _controller(workcell: Workcell, options: argparse.Namespace) -> str:
 
 
 def _timed(cell: Cell, x: Array, options: argparse.Namespace) -> Carry:
-    """Return the carry of an exported job with that timing."""
+    """Return the carry of an exported job with the timing of x."""
     model = cell.timing_model
     if options.planned_limit is not None:
         return exported_carry(cell, time_path(model, x, model.drive_limits(options.planned_limit)))

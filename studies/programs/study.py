@@ -1,4 +1,4 @@
-"""A whole study of a workcell: the settings that options give, its stages in order, its figures."""
+"""A whole study of a workcell: its settings from the options, its stages in order, its figures."""
 
 from __future__ import annotations
 
@@ -66,11 +66,11 @@ from symbolic.array import Array
 from symbolic.records import Workcell
 
 OPENING = ("table1_quality", "simulation")
-"""Tables that the terminal shows where a report has all of them: 25 lines in all."""
+"""Tables that the terminal shows if the report has all tables; 25 lines in total."""
 
 
 NOT_ASKED = "drivable carries were not searched for (--no-drivable)"
-"""Why a study without them recommends none."""
+"""Reason why a study without drivable carries recommends none."""
 
 
 @dataclass(frozen=True)
@@ -78,18 +78,19 @@ class StudySettings:
     """Settings of the parts of a study after its search.
 
     Attributes:
-        polish: how fronts are polished, None for not at all.
-        drivable: whether carries are also searched for as robots drive them.
-        drivable_replicas: of that search per algorithm, see `drivable_settings`.
-        drivable_polish: how their fronts are polished, None for not at all.
-        wish: target of the recommendation among them.
-        target: of the export that the recommendation names, None for any simulator.
-        simulate: whether the selected carries are driven in the simulated cell.
+        polish: settings of the polish; None for no polish.
+        drivable: whether drivable carries are searched too.
+        drivable_replicas: number of replicas of this search per algorithm; None for the default of
+            `drivable_settings`.
+        drivable_polish: settings of the polish of drivable fronts; None for no polish.
+        wish: target of the recommendation.
+        target: target of the export that the recommendation names; None for any simulator.
+        simulate: whether the selected carries are simulated in the whole cell.
         report: whether figures, tables and the page are written.
-        with_paper: whether the figures stand beside those that the paper states.
+        with_paper: whether the paper's figures are shown beside the study's.
         paper: whether the report has the paper's pictures.
         pdf: whether pictures are also written as PDF.
-        recommend_only: whether nothing is made that the recommendation does not need.
+        recommend_only: True to compute only what the recommendation needs.
     """
 
     polish: PolishSettings | None = None
@@ -107,8 +108,8 @@ class StudySettings:
 
 
 def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
-    """Return the stages of a study, in order; without a second experiment if the first is drivable
-    already."""
+    """Return the stages of a study in order. There is no second experiment if the first is
+    drivable."""
     every = [search_stage()]
     if study.polish is not None:
         every.append(polish_stage(study.polish))
@@ -146,7 +147,8 @@ def report_stage(study: StudySettings) -> Stage:
 
 
 def _paths_beside(folder: CampaignFolder) -> Array:
-    """Return the paths that the first experiment of a study found, for its drivable experiment."""
+    """Return the paths that the first experiment of a study found, as starts for the drivable
+    experiment."""
     return known_paths(folder.root.parent, folder.workcell.task)
 
 
@@ -157,11 +159,11 @@ def run_study(
     progress: Progress,
     study: StudySettings,
 ) -> str:
-    """Carry out all stages that are not done, and return the figures as text; the cell is read from
+    """Run all stages that are not done, and return the figures as text. The cell is read again from
     its file.
 
     Raises:
-        DualArmError: the workcell, a setting or the results folder is wrong, or work failed.
+        DualArmError: the workcell, a setting or the results folder is invalid, or a stage failed.
     """
     require_hold(workcell)  # before any work
     progress.note(budget_text(workcell))
@@ -196,8 +198,8 @@ def run_study(
 
 
 def study_text(root: Path, with_paper: bool, brief: bool = False) -> str:
-    """Format the figures of a finished study for a terminal, the carry to run first; only that one
-    if `brief` is set and it exists.
+    """Format the figures of a finished study for a terminal, with the recommended carry first. With
+    `brief`, only the recommended carry is shown, if there is one.
 
     Raises:
         ResultsError: the folder is not complete or damaged.
@@ -228,10 +230,10 @@ def study_text(root: Path, with_paper: bool, brief: bool = False) -> str:
 
 
 def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> None:
-    """Make a study of a workcell's file, print its figures, and show the requested views.
+    """Make a study of a workcell file, print its figures, and show the requested views.
 
     Raises:
-        DualArmError: the workcell, an option or the results folder is wrong, or work failed.
+        DualArmError: the workcell, an option or the results folder is invalid, or a stage failed.
     """
     cell = load_workcell(path)
     if options.target is not None:
@@ -277,8 +279,8 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
 def campaign_settings(
     options: argparse.Namespace, objectives: tuple[str, ...] = PAPER_OBJECTIVES
 ) -> CampaignSettings:
-    """Return the settings of the options, with these objectives if they name none; those of the
-    drivable experiment if only a recommendation is wanted.
+    """Return the campaign settings in the options, by default with the given objectives. If only a
+    recommendation is wanted, return those of the drivable experiment.
 
     Raises:
         SettingsError: a value is not allowed.
@@ -309,11 +311,11 @@ def campaign_settings(
 def polish_settings(
     options: argparse.Namespace, usual: bool, is_drivable: bool
 ) -> PolishSettings | None:
-    """Return the polish settings of the options, None for no polish.
+    """Return the polish settings in the options; None for no polish.
 
     Args:
-        options: of the program.
-        usual: whether to polish if they do not say.
+        options: options of the program.
+        usual: whether to polish if the options do not state it.
         is_drivable: whether the fronts are of a drivable cell.
 
     Raises:

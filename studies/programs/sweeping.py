@@ -33,11 +33,11 @@ from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
 
 REMARK = 60
-"""Characters of a remark that the terminal shows."""
+"""Largest number of characters of a remark in the terminal."""
 
 
 def sweep_numbers(options: argparse.Namespace) -> int:
-    """Sweep, and print and write the results."""
+    """Make a sweep, print the results and write them. Return the exit code."""
     if options.jobs != 1:
         warm_up("hybrid_opt.extras.sweeping")  # while this process finds the first path
     cell, over = Cell(load_workcell(options.workcell)).drivable(), dict(options.over)
@@ -73,7 +73,7 @@ def sweep_numbers(options: argparse.Namespace) -> int:
 
 
 def _of_file(cell: Cell, path: Path) -> Array:
-    """Return the decision vector of a stored carry, of this cell's shape."""
+    """Return the decision vector of a stored carry, which has to fit this cell."""
     x = read_trajectory(path).x
     n_path = cell.workcell.task.n_path
     if x.shape == (n_path,):
@@ -84,7 +84,7 @@ def _of_file(cell: Cell, path: Path) -> Array:
 
 
 def _table(done: Sweep, longest: int = sys.maxsize) -> Table:
-    """Build the table of a sweep, with its remarks cut to a maximal length."""
+    """Build the table of a sweep, with remarks cut to a maximal length."""
     rows = [
         (
             *(f"{v:g}" for v in row.values),
@@ -99,7 +99,8 @@ def _table(done: Sweep, longest: int = sys.maxsize) -> Table:
 
 
 def _figure(done: Sweep) -> Figure:
-    """Draw duration and force over the last key, a line per combination of the others."""
+    """Draw duration and force over the values of the last key, one line per combination of the
+    others."""
     figure = new_figure(0.45)
     panels = figure.subplots(1, 2)
     *outer, last = done.over

@@ -61,7 +61,7 @@ NOT_STATED = "the usual one, because the workcell states no [uncertainty]"
 
 
 def replay_file(options: argparse.Namespace) -> int:
-    """Re-evaluate a trajectory file and print both figures; returns the exit code."""
+    """Evaluate a trajectory file again, and print stored and new figures. Return the exit code."""
     stored = read_trajectory(options.file)
     with TemporaryDirectory() as folder:
         cell = stored.open_cell(Path(folder))
@@ -117,7 +117,8 @@ def _replayed(
 
 
 def _driven(cell: Cell, x: Array) -> ProgramResult:
-    """Plan the job around a drivable carry x (n_var,) as a study and an export do by default."""
+    """Plan the job around a drivable carry x (n_var,) with the defaults of a study and an
+    export."""
     try:
         job = job_model(cell.timing_model).plan(driven_timing(cell.timing_model, x))
     except DualArmError as error:
@@ -131,7 +132,7 @@ def _driven(cell: Cell, x: Array) -> ProgramResult:
 
 
 def export_file(options: argparse.Namespace) -> int:
-    """Write the bundle of a trajectory file and print its job; returns the exit code."""
+    """Write the bundle of a trajectory file, and print its job. Return the exit code."""
     require_target(options.target)
     path = Path(options.file)
     stored = read_trajectory(path)
@@ -157,17 +158,18 @@ def export_file(options: argparse.Namespace) -> int:
 
 
 def driver_changes(path: Path, workcell: Workcell) -> dict[str, Any]:
-    """Read drivers and tool loads of a workcell's robots from a file.
+    """Read the drivers and tool loads of a workcell's robots from a file.
 
     Args:
-        path: a file with `[[robots]]` sections: of them the keys `name`, `driver` and `tool_load`
-            count.
+        path: a file with `[[robots]]` sections, of which only the keys `name`, `driver` and
+            `tool_load` are read.
+        workcell: the workcell.
 
     Returns:
         Changes as `Cell.changed` takes them.
 
     Raises:
-        WorkcellError: the file cannot be read, or states nothing of these robots.
+        WorkcellError: the file cannot be read, or states nothing about these robots.
     """
     try:
         entries = safe_io.toml_tables(safe_io.read_bytes(path, safe_io.WORKCELL_BYTES))
@@ -202,7 +204,8 @@ def _chosen(
 
 
 def _report(job: Job, stiffness: float | None) -> str:
-    """Print the job's phases, the effects of position control and of a late arm, and warnings."""
+    """Return the text of a job's phases, of the effects of position control and of a late arm, and
+    of warnings."""
     parts = [repr(job)]
     if job.follower is not None:
         parts += [
@@ -220,7 +223,7 @@ def _report(job: Job, stiffness: float | None) -> str:
 
 
 def check_file(options: argparse.Namespace) -> int:
-    """Print the check of a joint trajectory in a cell; return the exit code."""
+    """Check a joint trajectory in a cell, and print the result. Return the exit code."""
     workcell = load_workcell(options.workcell)
     cell = Cell(workcell, compiled=InterpretedCell(workcell))
     trajectory = joint_trajectory(options.trajectory, cell.workcell)
@@ -231,7 +234,7 @@ def check_file(options: argparse.Namespace) -> int:
 
 
 def robust_forces(options: argparse.Namespace) -> int:
-    """Print the forces that hold for a trajectory file; returns the exit code."""
+    """Print the robust forces of a trajectory file. Return the exit code."""
     stored = read_trajectory(options.file)
     with TemporaryDirectory() as folder:
         cell = stored.open_cell(Path(folder))
@@ -265,7 +268,8 @@ def _robust_forces(cell: Cell, x: Array, options: argparse.Namespace) -> int:
 
 
 def _priced(model: RobustModel, carry: Carry, options: argparse.Namespace) -> int:
-    """Print the price of a set that is not empty, and random cases of it; returns the exit code."""
+    """Print the price of an uncertainty that is not empty, and a check in random cases. Return the
+    exit code."""
     price = robust_price(
         model,
         carry,
@@ -294,8 +298,8 @@ def _priced(model: RobustModel, carry: Carry, options: argparse.Namespace) -> in
 
 
 def _timed(cell: Cell, x: Array, limit: float) -> list[str]:
-    """Report the fastest timing of a path within a force limit [N], on planned forces and on robust
-    ones."""
+    """Return lines on the fastest timing of a path within a force limit [N], applied to planned
+    forces and to robust forces."""
     found = []
     for text, robust in (("planned forces", False), ("forces that hold in all cases", True)):
         timing = time_path(cell.timing_model, x, TimingLimits(force=limit, robust=robust))
