@@ -20,21 +20,24 @@ from hybrid_opt.robust.squeeze import breakdown_text
 from studies.study.recommendation import StoredRecommendation
 
 State = Literal["good", "doubtful", "bad"]
-"""Verdicts on a carry: it holds in every case without a warning; with one; it does not fit."""
+"""Verdict on a carry: 'good' if it holds in every case of the uncertainty without a warning,
+'doubtful' if it holds but warnings are left, 'bad' if it exceeds the reference forces, slips in a
+random case, or no job can be planned."""
 
 ADVICE, NOTICED = 3, 0.05
-"""Most changes that a terminal lists, and the least change of the force by one [N]."""
+"""Most changes of the cell that an answer lists, and the least effect on the force that a listed
+change must have [N]."""
 
 
 @dataclass(frozen=True)
 class Fact:
-    """One line of an answer.
+    """One line of an answer: a heading and a phrase.
 
     Attributes:
-        heading: its subject.
+        heading: the subject of the line, as 'time' or 'file'.
         text: one phrase.
-        is_command: the text is to be copied into a shell.
-        note: remark in smaller letters.
+        is_command: whether the text is a command to copy into a shell.
+        note: a remark that the page shows in smaller letters, '' for none.
     """
 
     heading: str
@@ -44,20 +47,21 @@ class Fact:
 
     @property
     def sentence(self) -> str:
-        """Text and note in one line."""
+        """The text and, if there is one, the note after a comma."""
         return f"{self.text}, {self.note}" if self.note else self.text
 
 
 @dataclass(frozen=True)
 class StudyAnswer:
-    """The opening of a study.
+    """The result of a study in words, which the terminal prints and the page shows first.
 
     Attributes:
-        state: the verdict on the carry.
-        headline: the carry in one line.
-        facts: the first screen of the page: time, force, job, and whether the forces hold.
-        commands: next commands.
-        details: everything else, the most important first.
+        state: the verdict on the recommended carry.
+        headline: the carry in one line, or that there is none.
+        facts: what the first screen of the page shows: time, force, job, and whether the forces
+            hold.
+        commands: the trajectory file and the next command.
+        details: all other lines, the most important first.
         warnings: objections against the carry.
     """
 
@@ -69,7 +73,7 @@ class StudyAnswer:
     warnings: tuple[str, ...] = ()
 
     def terminal(self) -> str:
-        """Return the text for a terminal."""
+        """Return the answer as lines of text for a terminal, warnings last."""
         shown = (*self.facts, *self.commands, *self.details)
         width = max(len(fact.heading) for fact in shown)
         lines = [self.headline]
@@ -78,33 +82,40 @@ class StudyAnswer:
 
 
 def carry_text(duration: float, force: float, job_duration: float, order: str) -> str:
-    """Format the line of a carry: its duration [s], its largest commanded force [N], the duration
-    of the whole job [s], NaN without one, and the command to the contacts."""
+    """Return a carry in one line of text.
+
+    Args:
+        duration: of the carry [s].
+        force: the largest normal force to command of the force-controlled arm [N].
+        job_duration: of the whole job [s]; NaN, without a job, is left out.
+        order: words before the force, as 'press with'.
+    """
     job = f", the whole job {seconds(job_duration)}" if math.isfinite(job_duration) else ""
     return f"{seconds(duration)}, {order} {newtons(force)}{job}"
 
 
 def job_text(job: Job) -> str:
-    """Format the line of a planned job's carry."""
+    """Return the carry of a planned job in one line of text."""
     carried, squeeze = job.phase("carry").duration, job.squeeze
     return carry_text(carried, squeeze.force, job.duration, squeeze.order)
 
 
 def seconds(duration: float) -> str:
-    """Format a duration for the first screen."""
+    """Return a duration [s] as text with two decimals and the unit."""
     return f"{duration:.2f} s"
 
 
 def newtons(force: float) -> str:
-    """Format a force for the first screen."""
+    """Return a force [N] as text with one decimal and the unit."""
     return f"{force:.1f} N"
 
 
 def answer(found: StoredRecommendation, folder: str) -> StudyAnswer:
-    """Format a stored recommendation as an answer.
+    """Return a stored recommendation as the answer of a study.
 
     Args:
-        folder: of the results, in front of the files' names; '' if it is the working folder.
+        folder: path of the results, put in front of the files' names; '' if it is the working
+            folder.
     """
     carry = carry_text(found.duration, found.force, found.job_duration, found.order)
     headline, file = f"Run this carry: {carry}", Path(folder) / found.file
@@ -149,7 +160,7 @@ _WITHIN = "each alone, in every case within the reference force on this path"
 
 
 def state_of(found: StoredRecommendation) -> State:
-    """Return the verdict on a carry from its properties."""
+    """Return the verdict on a recommended carry: see `State`."""
     failing = found.price is not None and found.price.check.failing > 0
     if not found.fits or failing or not math.isfinite(found.job_duration):
         return "bad"
@@ -170,7 +181,8 @@ def _facts(found: StoredRecommendation) -> tuple[Fact, ...]:
 
 
 def holds_text(found: StoredRecommendation) -> str:
-    """Say whether a carry holds in every case of the uncertainty within the reference forces."""
+    """Return a phrase that says whether a carry holds in every case of the uncertainty within the
+    reference forces."""
     if not found.fits:
         return f"not within the reference force: {newtons(found.required)} are needed"
     if found.price is None:
@@ -182,10 +194,11 @@ def holds_text(found: StoredRecommendation) -> str:
 
 
 def export_command(path: Path, target: str) -> str:
-    """Return the command that exports a trajectory file, timed within its own limits.
+    """Return the shell command that exports the trajectory file at `path`, timed within the limits
+    stored in it.
 
     Args:
-        target: of the export.
+        target: name of the export's target, as 'torque'.
     """
     output = path.with_name(f"{path.stem}-{target}")
     return (
@@ -195,7 +208,8 @@ def export_command(path: Path, target: str) -> str:
 
 
 def _rival(rival: Alternative, found: StoredRecommendation) -> str:
-    """Compare another path with the recommended carry."""
+    """Return a phrase that compares another path with the recommended carry: its duration at the
+    same force, and its force in the same duration."""
     duration, force = rival.duration_at_force, rival.force_at_duration
     same_force = "cannot be held with the same force"
     same_time = "cannot be driven in the same time"
@@ -210,7 +224,8 @@ def _rival(rival: Alternative, found: StoredRecommendation) -> str:
 
 
 def _checked(price: RobustPrice) -> str:
-    """Describe the set, the largest multiple of it that the arms allow, and random cases."""
+    """Return a phrase about the robust forces: how many random cases slip, the set of cases, and
+    the largest multiple of that set which the reference forces would hold."""
     slips = "slips" if price.check.failing == 1 else "slip"
     return (
         f"{price.check.failing or 'none'} of {price.check.cases} random cases {slips} "
@@ -224,8 +239,8 @@ def _percent(ratio: float) -> str:
 
 
 def _margins(found: StoredRecommendation) -> list[str]:
-    """Describe the largest single deviations that the commanded force tolerates: of force, and of
-    the centre of mass along each axis up to the nearer limit."""
+    """Return phrases about the largest single deviations that the commanded force tolerates: the
+    share of the force that may be missing, and the error of the centre of mass along each axis."""
     texts = [
         f"up to {100.0 * margin.limit:.0f} % of it may be missing"
         for margin in found.margins

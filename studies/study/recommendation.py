@@ -52,11 +52,12 @@ from symbolic.records import Task, Workcell
 
 @dataclass(frozen=True)
 class StoredDurations:
-    """Shortest durations at the forces of a table [s], null where a path cannot move.
+    """Shortest durations of one row of a `ForceTable`.
 
     Attributes:
-        label: of a path, or of all paths that the carry was chosen from.
-        durations: one per force, limits on jerk left out.
+        label: name of a path, or `FRONT` for all paths that the carry was chosen from.
+        durations: one per force of the table [s], limits on jerk ignored; null where no path can be
+            driven with that force.
     """
 
     label: str
@@ -65,12 +66,13 @@ class StoredDurations:
 
 @dataclass(frozen=True)
 class ForceTable:
-    """Durations at the same commanded forces.
+    """Shortest durations of some paths at the same commanded forces.
 
     Attributes:
-        forces: largest forces to command of the force-controlled arm [N]; the last one is the
-            reference force.
-        rows: hand-made path, recommended one, optimum of the other experiment, the front.
+        forces: largest normal forces to command of the force-controlled arm [N]; the last one is
+            the reference force.
+        rows: one each for the hand-made path, the recommended path, the least-force path of the
+            other experiment if there is one, and the whole front.
     """
 
     forces: tuple[float, ...]
@@ -83,40 +85,43 @@ EXPORT_TARGET = "torque"
 
 @dataclass(frozen=True)
 class StoredRecommendation:
-    """The carry to run.
+    """recommendation.json: the carry to run, with all figures that reports show of it.
 
     Attributes:
-        wish, why: the target, as values and as text.
-        source: whose it is, as 'NSGA-II, polished, replica 3'.
-        file: its trajectory file, relative to the folder.
-        duration: as robots drive it, limits on jerk kept [s].
-        force: largest force to command of the force-controlled arm [N]; the one force.
+        wish, why: what the carry was to be best at, as values and as text.
+        source: the search that found it, as 'NSGA-II, polished, replica 3'.
+        file: path of its trajectory file, relative to the results folder.
+        duration: of the carry as robots drive it, limits on jerk kept [s].
+        force: the largest normal force to command of the force-controlled arm [N].
         parts: contributions whose sum is the force.
         job_duration: of the whole job [s], null where none can be planned.
-        force_limit: of the search [N].
+        force_limit: the force limit of the search that the carry was timed with [N].
         peak_force: largest planned normal force of each robot [N].
-        robust_force: likewise in every case of the workcell's uncertainty, where force limits are
-            about these; else null.
+        robust_force: largest normal force of each robot in every case of the workcell's uncertainty
+            [N], if force limits apply to robust forces; else null.
         without_jerk: duration without the cell's limits on jerk [s], null where there are none.
-        squeeze, squeeze_reason: largest normal force to command of each robot [N], and why.
-        order: command to the contacts, as in 'press with'.
-        target: of the export that the study names.
-        payload_limit: payload that the robots bear on the same motion with planned forces, nothing
-            uncertain [kg].
-        rivals: other paths at the same force and in the same time, the hand-made one first.
-        margins: largest errors of the cell's description at the commanded force.
-        advice: effects of changes of the cell.
-        warnings: objections.
-        considered: carries that it was chosen from.
-        durations: of paths and the front at the same commanded forces.
-        price: of robustness, null where no set leaves friction and patches.
-        required: largest force of either arm in any case, commanded or resulting [N].
-        allowed: the robots' reference forces [N].
-        at_rest: text of the grip budget.
-        remedies: if the reference forces do not allow the carry, the smallest changes with which
-            they do.
-        reserve: heaviest box and least friction within the reference forces, in every case of the
-            uncertainty; null if unknown.
+        squeeze, squeeze_reason: largest normal force to command of each robot [N], and how it was
+            chosen.
+        order: words before the force in texts, as 'press with'.
+        target: target of the export command that the study prints.
+        payload_limit: largest payload that the robots bear on the same motion with planned forces,
+            if nothing is uncertain [kg].
+        rivals: other paths, compared at the same force and in the same time, the hand-made one
+            first.
+        margins: largest errors of the cell's description that the commanded force tolerates.
+        advice: effects that changes of the cell would have on the force.
+        warnings: objections against the carry.
+        considered: number of carries that it was chosen from.
+        durations: shortest durations of some paths at the same commanded forces.
+        price: the price of robustness, null for a cell without uncertainty.
+        required: largest normal force of either arm in any case of the uncertainty, commanded or
+            resulting [N].
+        allowed: (2,) reference force of each robot [N], null if unknown.
+        at_rest: the grip budget of the cell at rest, as text.
+        remedies: the smallest changes with which the reference forces would allow the carry, if
+            they do not.
+        reserve: heaviest box and least friction that the reference forces allow in every case of
+            the uncertainty, null if unknown.
     """
 
     wish: ho.Wish
@@ -151,38 +156,42 @@ class StoredRecommendation:
 
     @property
     def has_job(self) -> bool:
-        """Return True if robots can be given a job around the carry."""
+        """True if a whole job around the carry can be planned."""
         return math.isfinite(self.job_duration)
 
     @property
     def fits(self) -> bool:
-        """Return True if it holds in every case within the reference forces."""
+        """True if the carry holds in every case of the uncertainty within the reference forces."""
         return not self.remedies
 
     @property
     def force_kind(self) -> ForceKind:
-        """The forces that limits, of the table and of rivals too, are about."""
+        """Kind of normal forces, planned or robust, that force limits, the force table and the
+        rivals refer to."""
         return PLANNED_FORCE if self.robust_force is None else ROBUST_FORCE
 
     @property
     def limited_force(self) -> Array:
-        """(2,) largest of them of each robot [N]."""
+        """(2,) largest normal force of each robot that the force limit applies to, planned or
+        robust [N]."""
         return self.peak_force if self.robust_force is None else self.robust_force
 
 
 @dataclass(frozen=True)
 class NoRecommendation:
-    """no-recommendation.json: why a study has no carry to run."""
+    """no-recommendation.json: the reason why a study has no carry to run."""
 
     reason: str
 
 
 def recommendation_stage(wish: ho.Wish, target: str) -> Stage:
-    """Return the stage that writes `recommended.json`, a trajectory file, and
-    `recommendation.json`, or `no-recommendation.json`.
+    """Return the stage of a study that recommends a carry. The stage writes `recommended.json`, a
+    trajectory file, and `recommendation.json`; without a drivable carry only
+    `no-recommendation.json`.
 
     Args:
-        target: of the export that the recommendation names.
+        wish: what the carry is to be best at.
+        target: name of the export's target in the command that the study prints.
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
@@ -202,11 +211,11 @@ def recommendation_stage(wish: ho.Wish, target: str) -> Stage:
 
 
 def read_recommendation(root: Path) -> StoredRecommendation | NoRecommendation | None:
-    """Read the recommendation in a results folder, or the reason why there is none; None if none
-    was requested.
+    """Read the recommendation in a results folder, or the reason why there is none; return None if
+    the folder has neither file.
 
     Raises:
-        ResultsError: it is damaged.
+        ResultsError: the file is damaged.
     """
     remedy = f"delete {STAGES}/recommendation.json in its folder and continue with --resume"
     if (root / RECOMMENDATION).exists():
@@ -224,16 +233,19 @@ def recommend_from(
     target: str = EXPORT_TARGET,
     threads: int = 0,
 ) -> StoredRecommendation:
-    """Recommend a carry of a study's drivable fronts, and store it; return its text.
+    """Recommend a carry from the drivable fronts of a study, write its trajectory file, and return
+    the recommendation.
 
     Args:
-        root: the results folder, its drivable experiment done.
+        root: the results folder, in which the drivable experiment is finished.
+        wish: what the carry is to be best at.
         path: the trajectory file to write.
-        target: of the export that the recommendation names.
-        threads: threads that time carries, 0 for one per core; results do not depend on it.
+        target: name of the export's target, which the recommendation stores.
+        threads: number of threads that time carries, 0 for one per core; results do not depend on
+            it.
 
     Raises:
-        NoCarryError: no drivable carry was found; the text says why.
+        NoCarryError: no drivable carry was found; the message says why.
         SettingsError: no carry fulfils the wish.
         ResultsError: the folder is not complete or damaged, or the file cannot be written.
     """
@@ -307,15 +319,17 @@ def recommend_from(
 
 
 def _hand_made(cell: ho.Cell) -> Array:
-    """Return (1, n) the hand-made carry within the largest force limit, none where it is not
-    feasible: a front may lie behind it where the search was short."""
+    """Return the hand-made trajectory as a decision vector (1, n_var) with the largest force limit
+    of the bounds, or (0, n_var) if that is not feasible. It takes part because the front of a short
+    search may be worse."""
     x = np.append(cell.initial[:-1], cell.workcell.task.force_limit[1])
     found = cell.evaluator.certified(cell.evaluate(x))
     return np.asarray(found.x[found.feasible])
 
 
 def _why_none(cell: ho.Cell, results: CampaignResults) -> str:
-    """Describe what stopped the candidates of an experiment, and its hand-made trajectory."""
+    """Return a text that says which constraints the candidates of an experiment violated, and why
+    its hand-made trajectory cannot be driven."""
     found = concatenated([replica.evaluations for replica in results.replicas])
     stopped = ", ".join(
         f"{name.replace('_', ' ')} {100.0 * count / len(found):.1f} %"
@@ -338,8 +352,9 @@ def _force_table(
     found: Recommendation,
     advance: Advance,
 ) -> ForceTable:
-    """Time paths, and the front of carries x (k, n_var), at the same commanded forces, that of the
-    recommended carry among them."""
+    """Compute the shortest durations of the hand-made path, the recommended path, other paths, and
+    the front of the carries x (k, n_var), at some commanded forces that include the recommended
+    carry's."""
     n = cell.workcell.task.n_path
     forces = np.unique(np.append(table_forces(cell.workcell), found.force))
     paths = {HAND_MADE: cell.initial[:n], "recommended": found.x[:n]} | dict(others)
@@ -354,15 +369,21 @@ def _force_table(
 
 
 FRONT = "the front"
-"""All paths that the recommended carry was chosen from."""
+"""Label of the row for all paths that the recommended carry was chosen from."""
 
 LEAST_FORCE_PATH = "least-force"
-"""The path that the other experiment ends with, beside which the recommended carry stands."""
+"""Label of the balanced path of the experiment that minimises both robots' forces; the recommended
+carry is compared with it."""
 
 
 def known_paths(root: Path, task: Task) -> Array:
-    """Return paths (m, n_path) that another experiment ends with, in the waypoints of a task: of
-    all polished fronts together the balanced one, of each of them both ends and the middle.
+    """Return paths (m, n_path) from the results of an experiment, converted to the waypoints of
+    another search's task: the balanced path of all fronts, and the first, middle and last path of
+    every polished front.
+
+    Args:
+        root: results folder of the finished experiment.
+        task: the task of the other search.
 
     Raises:
         ResultsError: the experiment's folder is not complete or damaged.
@@ -376,8 +397,9 @@ def known_paths(root: Path, task: Task) -> Array:
 
 
 def least_force(campaign: CampaignResults, task: Task) -> dict[str, Array]:
-    """Return the balanced path (n_path,) of all fronts of an experiment, at the waypoints of a
-    task, by its label; empty if no carry was found."""
+    """Return a dictionary from `LEAST_FORCE_PATH` to the balanced path (n_path,) of all fronts of
+    an experiment, converted to the waypoints of `task`; an empty one if the experiment found no
+    carry."""
     evaluator = CandidateEvaluator(campaign.workcell, campaign.objectives)
     chosen = select(evaluator, np.concatenate([front.x for front in campaign.fronts]))
     if chosen is None:
@@ -387,11 +409,12 @@ def least_force(campaign: CampaignResults, task: Task) -> dict[str, Array]:
 
 
 def is_drivable(workcell: Workcell, objectives: Sequence[str]) -> bool:
-    """Return True if an experiment already is the search for carries as robots drive them."""
+    """Return True if an experiment of this workcell and these objectives already searches for
+    carries as robots drive them."""
     return workcell.task.law.is_drivable and tuple(objectives) in DRIVABLE_PAIRS
 
 
 def drivable_root(root: Path, workcell: Workcell, objectives: Sequence[str]) -> Path:
-    """Return the folder of a study's drivable experiment: one inside, unless the study's first
-    experiment, of this cell and these objectives, is the only one."""
+    """Return the folder of a study's drivable experiment: `root` itself if the study's first
+    experiment, of this workcell and these objectives, already is drivable; else a folder inside."""
     return root if is_drivable(workcell, objectives) else root / DRIVABLE

@@ -43,28 +43,30 @@ from symbolic.array import Array, Figure, Row, Shape, evenly
 from symbolic.errors import SettingsError
 
 MOST_SAMPLES = 240
-"""Most samples of the forces that are stored."""
+"""Most samples of the force curves of a simulation that are stored."""
 
 
 @dataclass(frozen=True)
 class StoredSimulation:
-    """One carry in the simulated cell.
+    """simulated/*.json: the result of one carry in the simulated cell.
 
     Attributes:
-        label: of the carry.
-        trajectory: SHA-256 of its file.
-        controller: of the arms.
-        problem: why there is no threshold, or no simulation, and nothing else then.
-        duration: [s].
-        slips, holds: multiples of the planned forces right below and above the threshold, null
-            where there is none.
-        pad, begins: where it slips first, 0 for nowhere, and when [s].
-        robust: whether the run that is shown presses with robust forces.
-        factor: there of the planned squeeze, null with robust forces.
-        arrives: whether the box held and ended at its goal.
-        slip, misses: largest slip, and distance from the goal [m].
-        time: (n,) [s].
-        predicted, simulated: (n, 2) normal force of each robot: reference, and measured [N].
+        label: name of the carry.
+        trajectory: SHA-256 of the carry's trajectory file.
+        controller: name of the control law of both arms.
+        problem: why there is no threshold or no simulation, '' if there is one; without a
+            simulation the other values are the defaults.
+        duration: of the carry [s].
+        slips, holds: multiples of the planned forces right below and right above the threshold of
+            slipping, null where there is none.
+        pad, begins: the pad that slips first right below the threshold, 1 or 2, 0 for none, and
+            when it does [s].
+        robust: True if the stored run presses with robust forces.
+        factor: multiple of the planned forces in the stored run, null with robust forces.
+        arrives: True if the box was held in the stored run and ended at its goal.
+        slip, misses: largest slip of a pad, and final distance of the box from its goal [m].
+        time: (n,) times of the samples from the beginning of the carry [s].
+        predicted, simulated: (n, 2) reference and measured normal force of each robot [N].
     """
 
     label: str
@@ -86,20 +88,22 @@ class StoredSimulation:
     simulated: Annotated[Array, Shape((None, 2))] = field(default_factory=lambda: np.zeros((0, 2)))
 
     def __post_init__(self) -> None:
-        """Refuse curves of different lengths."""
+        """Raise a ValueError if the curves have different lengths."""
         if not len(self.time) == len(self.predicted) == len(self.simulated):
             raise ValueError("its curves have different lengths")
 
     @property
     def peaks(self) -> Array:
-        """(2, 2) largest predicted and simulated force of each robot [N], NaN without any."""
+        """(2, 2) largest predicted (row 0) and simulated (row 1) normal force of each robot [N],
+        NaN without samples."""
         if not len(self.time):
             return np.full((2, 2), np.nan)
         return np.stack([self.predicted.max(axis=0), self.simulated.max(axis=0)])
 
     @property
     def largest_error(self) -> float:
-        """Largest difference of both forces of either robot over the reference, NaN without any."""
+        """Largest difference of a simulated from the predicted normal force, relative to the
+        predicted one, over samples and robots; NaN without samples."""
         if not len(self.time):
             return float("nan")
         return float(np.abs(self.simulated / self.predicted - 1.0).max())
@@ -108,7 +112,15 @@ class StoredSimulation:
 def stored_simulation(
     found: CarrySimulation, label: str, trajectory: str, controller: str
 ) -> StoredSimulation:
-    """Convert an account to its stored form: from the beginning of the carry on."""
+    """Convert the result of a simulation to the stored record; samples before the beginning of the
+    carry are left out.
+
+    Args:
+        found: result of the simulation.
+        label: name of the carry.
+        trajectory: SHA-256 of the carry's file.
+        controller: name of the control law of both arms.
+    """
     threshold, shown, squeeze, motion = (
         found.threshold,
         found.shown,
@@ -142,7 +154,7 @@ def stored_simulation(
 
 
 def read_simulations(root: Path) -> tuple[StoredSimulation, ...]:
-    """Read the simulations of a study's carries, in the order of their files.
+    """Read the simulations of a study's carries, sorted by the names of the files.
 
     Raises:
         ResultsError: a file is damaged.
@@ -160,9 +172,9 @@ class SimulationRequest:
     """A carry to simulate.
 
     Attributes:
-        name: of its file in the results, without suffix.
-        label: for people.
-        trajectory: as its file has it.
+        name: name of the file in `simulated/`, without suffix.
+        label: name of the carry in tables and pictures.
+        trajectory: the content of the carry's trajectory file.
         digest: SHA-256 of that file.
     """
 
@@ -173,7 +185,8 @@ class SimulationRequest:
 
 
 def simulation_stage() -> Stage:
-    """Return the stage that writes `simulated/`: one document per carry that the report shows."""
+    """Return the stage of a study that simulates every carry that the report shows, and writes one
+    file each in `simulated/`."""
     return Stage("simulation", _run, {"control": CONTROL})
 
 
@@ -200,7 +213,8 @@ def _file(root: Path, name: str) -> Path:
 
 
 def is_done(root: Path, one: SimulationRequest) -> bool:
-    """Return True if this very trajectory was simulated."""
+    """Return True if the results in `root` hold a simulation of exactly this trajectory with the
+    present control law."""
     try:
         stored = read_record(StoredSimulation, _file(root, one.name), "")
     except ResultsError:
@@ -209,7 +223,8 @@ def is_done(root: Path, one: SimulationRequest) -> bool:
 
 
 def wanted_carries(root: Path) -> list[SimulationRequest]:
-    """Return the carries that a report shows: hand-made, best of each algorithm, recommended."""
+    """Return the carries to simulate: the hand-made one, the best of each algorithm and the
+    recommended one, as far as their files exist."""
     summary = read_summary(root)
     shown, places = summary.shown_files, ["", *summary.algorithms]
     files = {
@@ -237,23 +252,26 @@ def _simulated(one: SimulationRequest) -> StoredSimulation:
 
 
 TIMING = "timing"
-"""Folder of the timings in a results folder, laid out as that of the selected trajectories."""
+"""Name of the folder of timings in a results folder; its files are laid out as those of the
+selected trajectories."""
 
 CURVE_POINTS = 12
-"""Points of the curve of duration against force limit, of trajectories that a report shows."""
+"""Number of force limits at which the trajectories that a report shows are timed."""
 
 Request = tuple[Array, int | None]
-"""Decision vector and number of points of the curve, None for no curve."""
+"""A decision vector (n_var,), and the number of force limits to time it at, None for no such
+curve."""
 
 
 def timing_stage(curves: bool = True) -> Stage:
-    """Return the stage that writes `timing/`: one document per selected trajectory.
+    """Return the stage of a study that times the selected trajectories as robots drive them, and
+    writes one file each in `timing/`.
 
-    Where the union of all fronts was polished, only its own trajectory and those that a report
-    shows have one.
+    If the union of all fronts was polished, only the trajectory selected from the union and those
+    that a report shows are timed.
 
     Args:
-        curves: whether those that a report shows are also timed at many force limits.
+        curves: whether trajectories that a report shows are also timed at many force limits.
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
@@ -287,12 +305,12 @@ def _document(cells: Cells, request: Request) -> TimingDocument:
 
 
 def limits_on_jerk(root: Path, recommended: StoredRecommendation | None) -> Table | None:
-    """Return the costs of the cell's limits on jerk for the selected carries, the hand-made one's
-    first, and for the recommended one; None where no jerk is limited.
+    """Return the table of durations with and without the cell's limits on jerk: of the selected
+    carries, the hand-made one first, and of the recommended carry. None where no jerk is limited.
 
     Args:
         root: results folder of the drivable experiment.
-        recommended: the carry to run, None without one.
+        recommended: the recommended carry, None without one.
 
     Raises:
         ResultsError: a timing is damaged.
@@ -326,7 +344,8 @@ def limits_on_jerk(root: Path, recommended: StoredRecommendation | None) -> Tabl
 
 
 def file_label(path: Path) -> str:
-    """Label of a trajectory, by the place of its file in the folder of selected ones."""
+    """Return the name of a trajectory for tables, made of the path of its file relative to the
+    folder of selected trajectories, as 'NSGA-II, polished'."""
     if len(path.parts) == 1:
         return path.stem
     folder = path.parts[0]

@@ -67,17 +67,19 @@ Share = Annotated[float, Range(0.0, 1.0)]
 
 @dataclass(frozen=True)
 class SelectedEntry:
-    """The solution selected from a front, or the hand-made trajectory.
+    """Figures of the solution selected from a front, or of the hand-made trajectory.
 
     Attributes:
-        evaluation: its number, from 1; 0 for the hand-made one.
-        file: its trajectory file, relative to the folder.
-        objectives: (n_obj,).
-        peak_normal_force, minimum_normal_force: per robot [N].
-        excess_above_static: per robot [%].
-        payload_limit: [kg].
-        duration: [s].
-        feasible: the evaluator's verdict.
+        evaluation: number of the candidate in the order of evaluation, from 1; 0 for the hand-made
+            one.
+        file: path of the trajectory file, relative to the results folder; None without a file.
+        objectives: (n_obj,) values of the objectives.
+        peak_normal_force, minimum_normal_force: largest and least normal force of each robot [N].
+        excess_above_static: (2,) peak of each robot above the force of the level payload at rest
+            [%].
+        payload_limit: largest payload that both robots bear on the same motion [kg].
+        duration: of the carry [s].
+        feasible: whether the trajectory satisfies all constraints.
     """
 
     evaluation: Count
@@ -92,20 +94,22 @@ class SelectedEntry:
 
     @property
     def mean_excess_above_static(self) -> float:
-        """Mean of both robots' [%]."""
+        """Mean over both robots of the peak force above that of the level payload at rest [%]."""
         return float(self.excess_above_static.mean())
 
 
 @dataclass(frozen=True)
 class FrontFigures:
-    """Indicators of a front, and of the solution selected from it.
+    """Indicators of a front, and the solution selected from it.
 
     Attributes:
-        non_dominated: points.
-        hypervolume, igd, igd_plus, spacing: see `hybrid_opt.indicators.metrics`.
-        mean_excess_above_static: of the selected solution [%].
-        payload_limit: of the selected solution [kg].
-        selected: None where no candidate is feasible.
+        non_dominated: number of points of the front.
+        hypervolume, igd, igd_plus, spacing: indicators as defined in
+            `hybrid_opt.indicators.metrics`.
+        mean_excess_above_static: of the selected solution, mean of both robots' peak forces above
+            the forces at rest [%].
+        payload_limit: largest payload of the selected solution [kg].
+        selected: the selected solution, None where no candidate is feasible.
     """
 
     non_dominated: Count
@@ -120,20 +124,22 @@ class FrontFigures:
 
 @dataclass(frozen=True)
 class PolishedFigures(PolishEffort, FrontFigures):
-    """A polished front, and the effort."""
+    """Indicators of a polished front, and the effort of the polish."""
 
 
 @dataclass(frozen=True)
 class ReplicaFigures(FrontFigures):
-    """One replica.
+    """Figures of one replica: one search with its own random seed.
 
     Attributes:
-        replica: its number, from 0.
-        evaluations, feasible, feasible_share: candidates.
+        replica: number of the replica, from 0.
+        evaluations, feasible, feasible_share: number of candidates, and number and share of
+            feasible ones.
         seconds: duration of the search.
-        infeasible_by_reason: candidates by what made them infeasible.
-        best_so_far: evaluations at which the best of an objective changed: number, then the best.
-        polished: None where the replica's front was not polished.
+        infeasible_by_reason: number of candidates by the constraint violated first.
+        best_so_far: one row for every evaluation that improved an objective: the number of the
+            evaluation, then the best value of each objective up to it.
+        polished: figures of the polished front, None where the replica's front was not polished.
     """
 
     replica: Count
@@ -148,7 +154,8 @@ class ReplicaFigures(FrontFigures):
 
 @dataclass(frozen=True)
 class PolishedStatistics:
-    """An algorithm's polished fronts, over the replicas."""
+    """Statistics over the replicas of an algorithm's polished fronts: of their figures by name and
+    of the gain in hypervolume, and the number of replicas that gained."""
 
     statistics: Mapping[str, Summary]
     hypervolume_gain: Summary
@@ -157,13 +164,14 @@ class PolishedStatistics:
 
 @dataclass(frozen=True)
 class AlgorithmFigures:
-    """One algorithm.
+    """Figures of one algorithm.
 
     Attributes:
-        representative: the replica with the largest hypervolume, None if it found nothing.
-        statistics: by figure, over the replicas.
-        replicas: in order.
-        polished: None where the replicas' fronts were not polished.
+        representative: number of the replica with the largest hypervolume, None if no replica found
+            a feasible candidate.
+        statistics: statistics over the replicas by the name of the figure.
+        replicas: the replicas in order.
+        polished: statistics of the polished fronts, None where they were not all polished.
     """
 
     representative: int | None
@@ -172,7 +180,8 @@ class AlgorithmFigures:
     polished: PolishedStatistics | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what does not belong together."""
+        """Raise a ValueError without replicas, or if the representative replica has no selected
+        solution."""
         if not self.replicas:
             raise ValueError("has no replicas")
         if self.representative is not None and not (
@@ -184,7 +193,7 @@ class AlgorithmFigures:
 
 @dataclass(frozen=True)
 class StoredFront:
-    """The campaign's reference front: its file, points and hypervolume."""
+    """The reference front of a campaign: path of its file, number of points and hypervolume."""
 
     file: str
     points: Count
@@ -193,12 +202,12 @@ class StoredFront:
 
 @dataclass(frozen=True)
 class NormalisationBounds:
-    """Bounds of the decision variables on which members of the best fronts lie.
+    """Bounds of the decision variables that members of the best fronts lie on.
 
     Attributes:
-        solutions: members of these fronts: of the polished union, else of all replicas' fronts,
-            polished where they were.
-        binding: the bounds that some of them lie on.
+        solutions: number of members: of the polished union if there is one, else of the fronts of
+            all replicas, polished where they were.
+        binding: the bounds that at least one member lies on.
     """
 
     solutions: Count
@@ -207,15 +216,15 @@ class NormalisationBounds:
 
 @dataclass(frozen=True)
 class CampaignSummary:
-    """summary.json.
+    """summary.json: all figures of a campaign.
 
     Attributes:
-        robots: their names, in the order of all pairs.
-        hand_made: the workcell file's own trajectory, None where it has no forces.
-        union: of a drivable experiment the polished union of all fronts, None without a polish.
-        recommendation: the carry to run, None where the study has none.
-        no_recommendation: why it has none, '' where it has one or where the study is part of
-            another, which recommends.
+        robots: names of both robots, in the order of all pairs of values.
+        hand_made: the workcell file's initial trajectory, None if not all its figures are finite.
+        union: the polished union of all fronts of a drivable experiment, None without a polish.
+        recommendation: the carry to run, None where the study recommends none.
+        no_recommendation: the reason why none is recommended; '' if one is, or if the experiment is
+            the drivable part of another study, which recommends.
     """
 
     workcell: StoredCell
@@ -235,7 +244,8 @@ class CampaignSummary:
     no_recommendation: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse what does not belong together."""
+        """Raise a ValueError unless there are two robots, the algorithms and replicas are those of
+        the settings, and the tests name known algorithms."""
         if len(self.robots) != 2:
             raise ValueError("does not name two robots")
         if list(self.algorithms) != list(self.settings.algorithms):
@@ -249,9 +259,9 @@ class CampaignSummary:
 
     @property
     def shown_files(self) -> dict[str, Path]:
-        """Files of the trajectories that a report shows, in the folders of selected ones and of
-        their timings: the hand-made one's by '', the best of every algorithm that has one by its
-        name."""
+        """Files of the trajectories that a report shows, relative to the folder of selected
+        trajectories and to that of timings: the hand-made one under the key '', the best of each
+        algorithm under the algorithm's name."""
         best = {
             name: entry.replicas[entry.representative]
             for name, entry in self.algorithms.items()
@@ -265,11 +275,12 @@ class CampaignSummary:
         return files
 
     def answer(self, folder: str) -> StudyAnswer | None:
-        """Return what a study opens with: the carry to run, or why there is none; None where
-        neither is known.
+        """Return the study's result in words: the carry to run, or the reason why there is none;
+        None where neither is stored.
 
         Args:
-            folder: of the results, as for `studies.study.answer.answer`.
+            folder: path of the results, put in front of the files' names; '' if it is the working
+                folder.
         """
         if self.recommendation is not None:
             return answer(self.recommendation, folder)
@@ -280,10 +291,10 @@ class CampaignSummary:
 
 
 def read_summary(root: str | Path) -> CampaignSummary:
-    """Read the figures of summary.json.
+    """Read summary.json from the results folder `root`.
 
     Raises:
-        ResultsError: it is missing, damaged, or not that of the campaign.
+        ResultsError: the file is missing, damaged, or that of a campaign with other settings.
     """
     path = Path(root) / SUMMARY
     remedy = f"delete {STAGES}/summary.json in its folder and continue the study with --resume"
@@ -297,29 +308,37 @@ _OF_FRONT = ("non_dominated", "hypervolume", "igd", "igd_plus", "spacing")
 _OF_CARRY = ("mean_excess_above_static", "payload_limit")
 
 SUMMARISED_FIGURES = ("feasible", "feasible_share", *_OF_FRONT, "seconds", *_OF_CARRY)
-"""Figures of a replica that are summarised over the replicas."""
+"""Names of a replica's figures whose statistics over the replicas are computed."""
 
 TESTED = tuple(name for name in SUMMARISED_FIGURES if name not in ("feasible", "seconds"))
-"""Figures that the algorithms are compared by; the count says the same as its share."""
+"""Names of the figures that statistical tests compare between algorithms; the number of feasible
+candidates is left out because the feasible share says the same."""
 
 POLISHED_FIGURES = (*_OF_FRONT, "seconds", "equivalent_evaluations", "widest_gap", *_OF_CARRY)
-"""Figures of a polished front that are summarised over the replicas."""
+"""Names of a polished front's figures whose statistics over the replicas are computed."""
 
 LEAST_TESTED = 5
-"""Replicas from which on algorithms are compared by tests: with fewer, the least p-value that an
+"""Least number of replicas for tests between algorithms. With fewer, the least p-value that an
 exact test can reach, 2 / binomial(2 n, n), is 0.028 or more before any correction."""
 
 
 def reference_front(fronts: Sequence[Array]) -> Array:
-    """Return (k, n_obj) non-dominated union of fronts; of all of a campaign, its reference for
-    IGD."""
+    """Return the non-dominated points (k, n_obj) of the union of fronts. That of all fronts of a
+    campaign is the reference of the IGD."""
     return metrics.front_of(np.concatenate(fronts))
 
 
 def front_indicators(
     front: Array, reference: Array, selected: SelectedCarry | None, file: str | None
 ) -> dict[str, Any]:
-    """Compute the fields of `FrontFigures` for a front's objectives (k, n_obj)."""
+    """Return the attributes of `FrontFigures` by name.
+
+    Args:
+        front: (n, n_obj) objectives of the front.
+        reference: (k, n_obj) reference front for the IGD.
+        selected: the selected carry, None without a feasible candidate.
+        file: path of its trajectory file, relative to the results folder.
+    """
     carry = None if selected is None else selected.carry
     return {
         "non_dominated": len(front),
@@ -338,7 +357,15 @@ def front_indicators(
 def replica_figures(
     replica: Replica, reference: Array, selected: SelectedCarry | None, file: str | None
 ) -> ReplicaFigures:
-    """Return one replica's entry in the summary; figures that do not exist are NaN or infinite."""
+    """Return the figures of one replica; those that do not exist without a feasible candidate are
+    NaN or infinite.
+
+    Args:
+        replica: the stored search.
+        reference: (k, n_obj) reference front for the IGD.
+        selected: the selected carry, None without a feasible candidate.
+        file: path of its trajectory file, relative to the results folder.
+    """
     found = replica.evaluations
     feasible = found.feasible
     return ReplicaFigures(
@@ -354,7 +381,9 @@ def replica_figures(
 
 
 def best_steps(history: Array) -> tuple[Array, ...]:
-    """Return the evaluations at which the best of an objective changed: [evaluation, best, ...]."""
+    """Return one row for every evaluation at which the best value of an objective changed: the
+    number of the evaluation from 1, then the best value of each objective. `history` (n, n_obj)
+    holds the best values after every evaluation, NaN before the first feasible one."""
     known = history[~np.isnan(history).any(axis=1)]
     first = len(history) - len(known)
     changes = np.flatnonzero((np.diff(known, axis=0) != 0.0).any(axis=1)) + 1
@@ -363,7 +392,13 @@ def best_steps(history: Array) -> tuple[Array, ...]:
 
 
 def carry_entry(carry: Carry, evaluation: int, file: str | None) -> SelectedEntry:
-    """Return the entry of an evaluated carry."""
+    """Return the summary's record of a judged carry.
+
+    Args:
+        evaluation: number of the candidate in the order of evaluation, from 1; 0 for the hand-made
+            one.
+        file: path of its trajectory file, relative to the results folder.
+    """
     assert carry.judgement is not None, "selected carries are judged"
     return SelectedEntry(
         evaluation=evaluation,
@@ -384,8 +419,14 @@ def campaign_summary(
     static: StaticHold,
     entries: Mapping[str, Sequence[ReplicaFigures]],
 ) -> CampaignSummary:
-    """Compute the figures of the search and of the polish, with the reference front (k, n_obj) and
-    per algorithm the entries of `replica_figures`."""
+    """Return the summary of a campaign from the figures of its replicas.
+
+    Args:
+        results: the campaign's results folder.
+        reference: (k, n_obj) reference front.
+        static: forces and payload limit of the level payload at rest.
+        entries: per algorithm the figures of its replicas.
+    """
     configuration = results.configuration
     corner = metrics.reference_point(len(results.objectives))
     return CampaignSummary(
@@ -426,10 +467,8 @@ def _algorithm_figures(rows: Sequence[ReplicaFigures]) -> AlgorithmFigures:
 
 
 def _tests(entries: Mapping[str, Sequence[ReplicaFigures]]) -> tuple[RankTest, ...]:
-    """Rank tests of every pair of algorithms in every figure, Holm-corrected as one family.
-
-    None with few replicas, whose effects say nothing.
-    """
+    """Return rank tests of every pair of algorithms in every figure of `TESTED`, with p-values
+    corrected by Holm as one family. Empty with fewer than `LEAST_TESTED` replicas."""
     if any(len(rows) < LEAST_TESTED for rows in entries.values()):
         return ()
     pairs = [(figure, *pair) for pair in itertools.combinations(entries, 2) for figure in TESTED]
@@ -448,12 +487,12 @@ def _tests(entries: Mapping[str, Sequence[ReplicaFigures]]) -> tuple[RankTest, .
 
 
 PERCENTILES = (25.0, 50.0, 75.0, 100.0)
-"""Percentiles of the attainment surfaces, in percent of the replicas."""
+"""Percentiles of the attainment surfaces that are written [% of the replicas]."""
 
 
 def summary_stage(not_asked: str = "") -> Stage:
-    """Return the stage that computes the figures of a finished search; `not_asked` is the reason of
-    a study without a recommendation."""
+    """Return the stage of a study that computes summary.json of a finished search. `not_asked` is
+    the reason that the summary states where no recommendation was requested."""
 
     return Stage("summary", partial(_run, not_asked=not_asked))
 
@@ -507,7 +546,8 @@ def _run(folder: CampaignFolder, progress: Progress, not_asked: str) -> None:
 
 
 def _polished_figures(folder: CampaignFolder, front: Front, reference: Array) -> PolishedFigures:
-    """Compute the figures of a polished front, and store its selected trajectory."""
+    """Return the figures of a polished front, and write the trajectory file of the solution
+    selected from it."""
     assert front.polished is not None
     chosen = select(folder.cell.evaluator, front.x)
     path = polished_selected_file(folder.root, *front.key)
@@ -517,8 +557,8 @@ def _polished_figures(folder: CampaignFolder, front: Front, reference: Array) ->
 
 
 def _store_hand_made(folder: CampaignFolder) -> SelectedEntry | None:
-    """Write the workcell file's own trajectory, feasible or not, beside the selected ones; its
-    figures, None where it has not all of them."""
+    """Write the trajectory file of the workcell file's initial trajectory, feasible or not. Return
+    the record of the trajectory, None if one of its figures is not finite."""
     carry = folder.cell.carry(folder.cell.initial)
     source = {"source": "the workcell file's initial trajectory"}
     file = _store(folder, folder.root / SELECTED / HAND_MADE_FILE, carry, source)
@@ -531,7 +571,8 @@ def _store_hand_made(folder: CampaignFolder) -> SelectedEntry | None:
 def _store_selected(
     folder: CampaignFolder, path: Path, replica: tuple[str, int], selected: SelectedCarry | None
 ) -> str | None:
-    """Write a selected trajectory; returns its path in the folder, None where there is none."""
+    """Write the trajectory file of a selected carry. Return its path relative to the results
+    folder, None without a selected carry."""
     if selected is None:
         return None
     provenance = {
@@ -544,7 +585,8 @@ def _store_selected(
 
 
 def _store(folder: CampaignFolder, path: Path, carry: Carry, provenance: Mapping[str, Any]) -> str:
-    """Write a judged carry; returns its path in the folder."""
+    """Write the trajectory file of a judged carry, and return its path relative to the results
+    folder."""
     with storing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     # An infeasible one may be without some of its figures.

@@ -50,16 +50,16 @@ REPLICA_QUANTITIES = {
     "widest_gap": Quantity("widest gap", "%", 0, 100.0),
     "equivalent_evaluations": Quantity("evaluations as long", digits=0),
 }
-"""Figures of replicas by their names in summary.json."""
+"""How tables print a replica's figures, by their names in summary.json."""
 
 MOST_BOUNDS = 8
-"""Bounds of one experiment that are listed."""
+"""Most bounds of one experiment that the table of bounds lists."""
 
 
 PAPER = {"nsga2": ("694", "69.4", "16.71"), "mopso": ("296", "29.6", "16.06")}
-"""What the paper's text states of an algorithm on its rack; its tables are not reproduced: feasible
-candidates of 1000, their share [%] (Section 7), and the payload at which the selected trajectory
-reaches 12 kgf [kg] (Section 6.3)."""
+"""Values that the text of the paper states for an algorithm on its rack: feasible candidates of
+1000, their share [%] (Section 7), and the payload at which the selected trajectory reaches 12 kgf
+[kg] (Section 6.3). The paper's tables are not reproduced."""
 
 
 def study_tables(
@@ -69,14 +69,15 @@ def study_tables(
     simulations: Sequence[StoredSimulation] = (),
     with_paper: bool = False,
 ) -> tuple[Table, ...]:
-    """Return all tables that need no more than a study's documents.
+    """Return the tables of a study that can be made from its stored documents alone, without its
+    workcell.
 
     Args:
-        summary: of its first experiment.
-        drivable: of the drivable experiment beside that, None without one.
-        jerk: what limits on jerk cost, see `studies.study.simulation.limits_on_jerk`.
-        simulations: carries in the simulated cell.
-        with_paper: whether figures that the paper states of its own rack stand beside ours.
+        summary: of the study's first experiment.
+        drivable: summary of a second, drivable experiment, None without one.
+        jerk: the table of `studies.study.simulation.limits_on_jerk`, None without one.
+        simulations: simulated carries.
+        with_paper: whether rows with the paper's values stand beside those of the study.
     """
     found = summary.recommendation
     tables = [quality(summary, with_paper), selected(summary, with_paper)]
@@ -104,7 +105,14 @@ def quality(
     name: str = "table1_quality",
     heading: str = "Table 1. Quality of the search.",
 ) -> Table:
-    """Build the table of indicators over the replicas (paper Table 1)."""
+    """Return the table of the fronts' indicators, over the replicas of each algorithm (paper Table
+    1).
+
+    Args:
+        with_paper: whether rows with the paper's values are added.
+        name: name of the table's file, without suffix.
+        heading: sentence above the table.
+    """
     rows = []
     for algorithm, entry in summary.algorithms.items():
         for label, figures in _variants(algorithm, entry):
@@ -128,7 +136,8 @@ def quality(
 
 
 def _variants(name: str, entry: AlgorithmFigures) -> list[tuple[str, list[FrontFigures]]]:
-    """Yield an algorithm's replicas as searched, and as polished if they were."""
+    """Return the rows of an algorithm: a label and the figures of all replicas as searched; and, if
+    they were polished, a label and the figures of the polished fronts."""
     found: list[tuple[str, list[FrontFigures]]] = [(title(name), list(entry.replicas))]
     polished = [row.polished for row in entry.replicas if row.polished is not None]
     return found + ([(f"{title(name)} + polish", list(polished))] if polished else [])
@@ -138,13 +147,14 @@ _OF_UNION = "Union: the non-dominated candidates of all replicas, polished as on
 
 
 def _polished_union(summary: CampaignSummary) -> list[tuple[str, list[FrontFigures]]]:
-    """Return the polished union of a drivable experiment's fronts, if there is one."""
+    """Return one row, a label and the figures of the polished union of a drivable experiment's
+    fronts; an empty list without one."""
     return [] if summary.union is None else [(f"{UNION} + polish", [summary.union])]
 
 
 def _over_replicas(figures: Sequence[FrontFigures], key: str, mean: bool = False) -> str:
-    """Format median and quartiles of a figure over replicas, or mean and standard deviation; some
-    figures only searched or only polished replicas have."""
+    """Return the text of a figure over replicas: median and quartiles, or mean and standard
+    deviation if `mean`. A dash where the records have no such figure."""
     if not hasattr(figures[0], key):
         return NOTHING
     found, quantity = summarise([getattr(row, key) for row in figures]), REPLICA_QUANTITIES[key]
@@ -160,13 +170,15 @@ def _table(
     of: Iterable[Any],
     note: str,
 ) -> Table:
-    """Build a table with one row per record; `columns` maps names to functions of a record."""
+    """Return a table with one row per record of `of`; `columns` maps the heading of a column to the
+    function that makes the text of a record's cell."""
     rows = tuple(tuple(told(one) for told in columns.values()) for one in of)
     return Table(name, heading, tuple(columns), rows, note)
 
 
 def selected(summary: CampaignSummary, with_paper: bool) -> Table:
-    """Build the table of normal forces of the selected trajectories (paper Table 2)."""
+    """Return the table of normal forces of the selected trajectories (paper Table 2). `with_paper`
+    adds rows with the paper's values."""
     rows = [_forces("hand-made", summary.hand_made)]
     for name, entry in summary.algorithms.items():
         if entry.representative is None:
@@ -223,8 +235,8 @@ def _pressed(
 
 
 def replicas(summary: CampaignSummary) -> Table:
-    """Build the table of the selected carries of all replicas, and of their improvement by the
-    polish."""
+    """Return the table of the carries selected from all replicas, and of what the polish
+    improved."""
     rows, keys = [], ("mean_excess_above_static", "payload_limit")
     for name, entry in summary.algorithms.items():
         for label, figures in _variants(name, entry):
@@ -249,7 +261,8 @@ def replicas(summary: CampaignSummary) -> Table:
 
 
 def effort(summary: CampaignSummary) -> Table:
-    """Time of a replica; only printed and not stored, because times differ from run to run."""
+    """Return the table of computing times per replica. It is printed and never stored, because
+    times differ from run to run."""
     keys = ("seconds", "equivalent_evaluations")
     every = [each for name, entry in summary.algorithms.items() for each in _variants(name, entry)]
     every += _polished_union(summary)
@@ -264,7 +277,7 @@ def effort(summary: CampaignSummary) -> Table:
 
 
 def _solvers(summary: CampaignSummary) -> str:
-    """Describe the solvers of the polish in a sentence, '' without one."""
+    """Return a sentence that names the solvers of the polish, '' without a polish."""
     rows = [row.polished for entry in summary.algorithms.values() for row in entry.replicas]
     rows.append(summary.union)
     names = sorted({polished.solver for polished in rows if polished is not None})
@@ -272,7 +285,8 @@ def _solvers(summary: CampaignSummary) -> str:
 
 
 def infeasible(summary: CampaignSummary) -> Table:
-    """Build the table of the constraints that made candidates infeasible."""
+    """Return the table of the constraints that made candidates infeasible, in percent of each
+    algorithm's candidates."""
     shares: dict[str, dict[str, float]] = {}
     for name, entry in summary.algorithms.items():
         counts = sum((Counter(row.infeasible_by_reason) for row in entry.replicas), Counter[str]())
@@ -294,7 +308,8 @@ def infeasible(summary: CampaignSummary) -> Table:
 
 
 def constraint_title(name: str, robots: Sequence[str]) -> str:
-    """Return a constraint's title, with the arm's name for its number."""
+    """Return a constraint's name for people: 'joint_limits_1' becomes 'joint limits', followed by
+    the name of robot 1."""
     words = name.split("_")
     if words[-1].isdigit():
         return f"{' '.join(words[:-1])}, {robots[int(words[-1]) - 1]}"
@@ -302,8 +317,8 @@ def constraint_title(name: str, robots: Sequence[str]) -> str:
 
 
 def bounds(search: NormalisationBounds, drivable: NormalisationBounds | None = None) -> Table:
-    """Build the table of the bounds of the variables that the best fronts lie on, of one or both
-    experiments."""
+    """Return the table of the bounds of the decision variables that members of the best fronts lie
+    on, of one experiment or of both."""
     rows = []
     for name, found in (("search", search), ("drivable", drivable)):
         if found is None:
@@ -329,7 +344,7 @@ def bounds(search: NormalisationBounds, drivable: NormalisationBounds | None = N
 
 
 def rank_tests(summary: CampaignSummary) -> Table:
-    """Build the table of Mann-Whitney tests between algorithms."""
+    """Return the table of the Mann-Whitney tests between algorithms."""
     return _table(
         "tests",
         "Comparison over replicas.",
@@ -347,7 +362,8 @@ def rank_tests(summary: CampaignSummary) -> Table:
 
 
 def time_against_force(found: StoredRecommendation) -> Table:
-    """Tabulate how long paths and the front take at the same commanded forces."""
+    """Return the table of the shortest durations of some paths and of the front at the same
+    commanded forces."""
     table = found.durations
     return Table(
         "time_against_force",
@@ -361,8 +377,8 @@ def time_against_force(found: StoredRecommendation) -> Table:
 
 
 def robust_price(price: RobustPrice, robots: Sequence[str]) -> Table:
-    """Build the table of the recommended carry's forces that hold for multiples of a set of
-    cases."""
+    """Return the table of the recommended carry's peak normal forces that hold in multiples of the
+    uncertainty. `robots` are the names of both robots."""
     check, of = price.check, "" if price.uncertainty.stated else ", the usual one"
     return Table(
         "robust_price",
@@ -380,7 +396,7 @@ def robust_price(price: RobustPrice, robots: Sequence[str]) -> Table:
 
 
 def simulated(found: Sequence[StoredSimulation]) -> Table:
-    """Build the table of carries in the simulated cell."""
+    """Return the table of the carries that were driven in the simulated cell."""
 
     def holds(one: StoredSimulation) -> str:
         return f"{one.slips:.3f} to {one.holds:.3f}" if math.isfinite(one.holds) else one.problem
@@ -414,11 +430,12 @@ def simulated(found: Sequence[StoredSimulation]) -> Table:
 
 
 LabelledTimings = Sequence[tuple[str, TimingDocument]]
-"""Timings of trajectories by their labels; a trajectory alone needs none."""
+"""Pairs of a trajectory's label and its timings; the label of a single trajectory may be ''."""
 
 
 def timings(timed: LabelledTimings, robots: Sequence[str]) -> Table:
-    """Build the table of durations and forces under the search's timing and under drivable ones."""
+    """Return the table of durations and forces of trajectories, under the timing of the search and
+    under timings that robots can drive. `robots` are the names of both robots."""
     return Table(
         "timing",
         "What real timing makes of the selected trajectories.",
@@ -468,8 +485,8 @@ def _timing_cells(timing: StoredTiming) -> tuple[str, ...]:
 
 
 def margins(timed: LabelledTimings) -> Table:
-    """Compute how far the model's assumptions may be off under the drivable timing, which at least
-    one of the trajectories has."""
+    """Return the table of how far assumptions of the model may be off before a carry fails, under
+    the timing that robots drive. At least one of the trajectories must have margins."""
     judged = [(label, document.margins) for label, document in timed if document.margins]
     rows = []
     for found in zip(*(margins for _, margins in judged), strict=True):
@@ -493,7 +510,7 @@ def margins(timed: LabelledTimings) -> Table:
 
 
 def force_curve(curve: ForceCurve) -> Table:
-    """Build the table of durations against force limits."""
+    """Return the table of the shortest duration of one path at each of several force limits."""
     rows = zip(curve.force, curve.duration, curve.status, strict=False)
     return Table(
         "force_curve",
