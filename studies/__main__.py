@@ -16,11 +16,12 @@ COMMAND = "dual-arm-carry"
 """The command that `pyproject.toml` installs."""
 
 START = "main.start()"
-"""Last line of every program."""
+"""Last line of the source file of every program, by which `programs` finds them."""
 
 
 def programs() -> dict[str, tuple[str, str]]:
-    """Return the module and first sentence of every program, by name."""
+    """Return the module and the first sentence of every program's description, by the name of the
+    program."""
     folder = Path(__file__).parent
     found = {}
     doors = ("*.py", "*/*.py", "*/*/__main__.py")
@@ -38,11 +39,12 @@ def programs() -> dict[str, tuple[str, str]]:
 
 
 def main(arguments: Sequence[str] | None = None, called: str = "python -m studies") -> int:
-    """Run the program that the first word names, or list all; returns the exit code.
+    """Run the program named by the first argument, or list all programs without one. Return the
+    exit code.
 
     Args:
-        arguments: the command line, None for the process's own.
-        called: how it is called.
+        arguments: the arguments of the command line, None for those of this process.
+        called: how the command was called, for messages.
     """
     known = programs()
     given = list(sys.argv[1:] if arguments is None else arguments)
@@ -68,7 +70,7 @@ def main(arguments: Sequence[str] | None = None, called: str = "python -m studie
 
 
 def command() -> None:
-    """Run the installed command, and end the process."""
+    """Run the installed command `dual-arm-carry`, and end the process with its exit code."""
     sys.exit(run_program(partial(main, called=COMMAND)))
 
 

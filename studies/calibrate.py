@@ -32,7 +32,8 @@ def _add_options(parser: Parser) -> None:
 
 
 def calibrate(options: argparse.Namespace) -> int:
-    """Calibrate as the options state, and print the result; return the exit code."""
+    """Calibrate a cell from recorded runs, print the result, and write the calibrated workcell file
+    if one is named. Return the exit code."""
     from hybrid_opt.extras.calibrating import evidence as found_in
     from hybrid_opt.extras.calibrating.recording import read_run
     from hybrid_opt.store.files import AGAIN, write_atomically

@@ -17,13 +17,13 @@ from studies.report import PAGE
 OUTPUT = Path("results/demo")
 
 SHOWN = 5
-"""Carries of the first front that are shown."""
+"""Number of carries of the first front that the demo prints."""
 
 LARGEST_SLOWDOWN = 2.0
-"""Times the shortest duration that a shown carry may take."""
+"""Only carries that take at most this multiple of the shortest duration are printed."""
 
 BINDING_USE = 0.99
-"""Used so far, a limit holds a carry back."""
+"""A limit is named as one that holds a carry back if the carry uses more than this share of it."""
 
 
 def _add_options(parser: Parser) -> None:
@@ -37,7 +37,8 @@ def _add_options(parser: Parser) -> None:
 
 
 def show(options: argparse.Namespace) -> int:
-    """Show a first result, then make the rack's quick study; returns the exit code."""
+    """Print a first result, then make the rack's quick study and open its page in a browser if
+    wanted. Return the exit code."""
     began = time.monotonic()
     for part in first_result():
         print(f"{part}\n", flush=True)
@@ -56,11 +57,12 @@ def show(options: argparse.Namespace) -> int:
 
 
 def first_result(evaluations: int = QUICK_EVALUATIONS, seed: int = 1) -> Iterator[str]:
-    """Show which limits hold the rack's hand-made carry back, then a first front.
+    """Yield texts to print: first the limits that hold the rack's hand-made carry back, then a
+    first front of a short search.
 
     Args:
-        evaluations: candidates of the search.
-        seed: of its randomness.
+        evaluations: number of candidates of the search.
+        seed: of the search's random numbers.
     """
     import numpy as np
 
@@ -98,7 +100,8 @@ def first_result(evaluations: int = QUICK_EVALUATIONS, seed: int = 1) -> Iterato
 
 
 def _held(timing: ho.Timing) -> str:
-    """Return the limits that a carry uses fully."""
+    """Return the names of the limits that a timed carry uses fully, friction left out; the reason
+    of a failed timing."""
     if not timing.ok:
         return timing.reason
     # The least forces always use the whole friction.

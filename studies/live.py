@@ -27,13 +27,11 @@ def _add_options(parser: Parser) -> None:
 
 
 def serve(options: argparse.Namespace) -> int:
-    """Serve a cell until Ctrl-C, opened with a carry within the reference force where there is one.
-
-    Returns:
-        The exit code.
+    """Serve a page on which a cell can be changed, until Ctrl-C. The first carry shown keeps within
+    the reference force if one is found. Return the exit code.
 
     Raises:
-        DualArmError: the cell has no drivable form, or viser is missing.
+        DualArmError: the cell has no drivable form, or the package viser is not installed.
     """
     from hybrid_opt.campaign.stages import build_study
     from hybrid_opt.progress import Progress

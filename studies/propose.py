@@ -19,7 +19,11 @@ from symbolic.errors import SettingsError
 
 
 def _ranges(text: str) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Parse the two ranges of 'LOW:HIGH,LOW:HIGH'; (0, 0) for a missing second one."""
+    """Parse two ranges in metres from 'LOW:HIGH,LOW:HIGH'; without the second range it is (0, 0).
+
+    Raises:
+        argparse.ArgumentTypeError: there are more than two ranges, or a range is reversed.
+    """
     read, found = number(-1.0, 1.0), []
     for part in text.split(","):
         low, _, high = part.partition(":")
@@ -129,15 +133,19 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _next_command(options: argparse.Namespace) -> str:
-    """Return the command that makes a study of the proposed cell."""
+    """Return the shell command that makes a quick study of the proposed cell."""
     target = [] if options.target is None else ["--target", options.target]
     words = ["dual-arm-carry", "run", str(options.output), "--quick", *target]
     return shlex.join(words)
 
 
 def _teller(worked: Callable[[], float]) -> Callable[[str], None]:
-    """Return a function that prints the current step and the seconds of work, without repeating
-    a line."""
+    """Return a function that prints a text with the seconds worked so far, unless it is the text
+    printed last.
+
+    Args:
+        worked: returns the seconds worked so far.
+    """
     last = [""]
 
     def tell(text: str) -> None:

@@ -41,7 +41,8 @@ def _add_options(parser: Parser) -> None:
 
 
 def _uncertainty(text: str) -> float | dict[str, float]:
-    """Read a factor, or ranges by their names in a workcell file."""
+    """Parse a factor on all ranges of the uncertainty, or ranges by their names in a workcell file
+    from 'NAME=VALUE,NAME=VALUE'."""
     if "=" not in text:
         return number(0.0, 20.0)(text)
     read, found = number(0.0, 1e7), {}

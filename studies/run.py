@@ -57,21 +57,21 @@ FURTHER = (
     "--view",
     "--port",
 )
-"""Options of a study that `--help` only names."""
+"""Options of a study that `--help` lists by name only, without a description."""
 
 WORKERS_LOAD = (
     "hybrid_opt.campaign.polish_stage",
     "studies.study.recommendation",
     "studies.report.generate",
 )
-"""Modules that the work of a study needs."""
+"""Modules that the server process of a study loads in advance, before it forks workers."""
 
 
 def add_options(parser: Parser, output: str) -> None:
-    """Add the options of a study.
+    """Add the options of a study to a program's parser.
 
     Args:
-        output: the results folder where none is given, for the help.
+        output: the default results folder, for the help text.
     """
     search = parser.add_argument_group("search (decides the results)")
     search.add_argument(
@@ -226,8 +226,13 @@ def add_options(parser: Parser, output: str) -> None:
 
 
 def study_of(workcell: Path, options: argparse.Namespace, with_paper: bool = False) -> int:
-    """Make the study of a workcell's file as the options state, with the paper's figures beside
-    its own where they are wanted; returns the exit code."""
+    """Make the study of a workcell file with parsed options. Return the exit code.
+
+    Args:
+        workcell: path of the workcell file.
+        options: as parsed with the options of `add_options`.
+        with_paper: whether tables have rows with the values that the paper states.
+    """
     again = [part for part in options.arguments if part not in ("--resume", "--overwrite")]
     command = " ".join([options.called, shlex.join([*again, "--resume"])])
 
@@ -244,7 +249,7 @@ def study_of(workcell: Path, options: argparse.Namespace, with_paper: bool = Fal
 
 
 def _stated(field: str) -> Any:
-    """Return the default of a campaign's setting."""
+    """Return the default value of a field of `CampaignSettings`, without importing the class."""
     return stated(f"hybrid_opt.campaign.settings.CampaignSettings.{field}")
 
 
@@ -263,7 +268,12 @@ def _add_options(parser: Parser) -> None:
 
 
 def complete(options: argparse.Namespace, name: str) -> None:
-    """Fill in the results folder of a study of this name, and require the extras it needs."""
+    """Fill in the default results folder `results/NAME`, and check that the installed extras
+    suffice for the options.
+
+    Raises:
+        SettingsError: an extra is not installed.
+    """
     ending = "-recommended" if options.recommend_only else ""
     options.output = options.output or Path("results") / f"{name}{ending}"
     if options.simulate:

@@ -36,7 +36,7 @@ def _add_options(parser: Parser) -> None:
 
 
 def add_scene(options: argparse.Namespace) -> int:
-    """Print a scene's bodies, or add them to a file; returns the exit code."""
+    """Print the bodies of a scene, or add them to a workcell file. Return the exit code."""
     from symbolic.read.editing import completed
     from symbolic.read.scenes import read_scene
 

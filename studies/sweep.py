@@ -17,7 +17,12 @@ MOST_VALUES = 1000
 
 
 def _over(text: str) -> tuple[str, tuple[float, ...]]:
-    """Parse a key and its values: of 'KEY=6:14:2', both ends included, or of 'KEY=6,8,11'."""
+    """Parse a key of the workcell file and its values, from 'KEY=FIRST:LAST:STEP' with both ends
+    included, or from 'KEY=VALUE,VALUE'.
+
+    Raises:
+        argparse.ArgumentTypeError: the text has another form, or more than `MOST_VALUES` values.
+    """
     key, _, given = text.partition("=")
     read = number(-1e9, 1e9)
     parts = [read(part) for part in given.replace(",", ":").split(":")] if key and given else []

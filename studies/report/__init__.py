@@ -3,4 +3,4 @@
 PAGE = "report.html"
 PICTURES = "figures"
 TABLES = "tables"
-"""Places in a results folder."""
+"""Names of the page and of the folders of pictures and tables in a results folder."""

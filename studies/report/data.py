@@ -52,17 +52,18 @@ from symbolic.records.task import initial_decision
 INITIAL_LABEL = Path(HAND_MADE_FILE).stem
 
 REACH_SEED = 0
-"""Seed of the postures that the reach is drawn from; no result depends on it."""
+"""Seed of the random postures from which the pictures of the arms' reach are drawn; no result
+depends on it."""
 
 
 @dataclass(frozen=True)
 class ReportRun:
-    """One replica of one algorithm.
+    """One replica of one algorithm: its fronts and their indicators.
 
     Attributes:
-        front: of the search.
-        hybrid: its polished front, None without a polish.
-        figures: indicators of both, as in summary.json.
+        front: the front of the search.
+        hybrid: the polished front, None without a polish.
+        figures: indicators of both fronts, as in summary.json.
     """
 
     front: Front
@@ -71,28 +72,29 @@ class ReportRun:
 
     @property
     def feasible(self) -> Array:
-        """(k, n_obj) objectives of the search's feasible candidates."""
+        """(k, n_obj) objectives of the feasible candidates of the search."""
         found = self.front.evaluations
         return found.objectives[found.feasible]
 
     @property
     def fronts(self) -> tuple[Front, ...]:
-        """The non-empty fronts of the search and of its polish."""
+        """The front of the search and, if it is not empty, the polished front."""
         return (self.front, *([self.hybrid] if self.hybrid else []))
 
 
 @dataclass(frozen=True)
 class AlgorithmRuns:
-    """All replicas of one algorithm.
+    """All replicas of one algorithm, and how it is drawn.
 
     Attributes:
-        name, title: on the command line, and for people.
-        look: of all that is drawn of it, by its place in the campaign.
+        name: as on the command line.
+        title: the name for people.
+        look: line, colour and marker of the algorithm in all pictures.
         runs: the replicas.
-        representative: position in `runs` of the one with the largest hypervolume, which the
-            figures of single runs show (the paper's 'best-performing run').
-        best: of that run's polished front, else of its front, the selected trajectory; None if the
-            algorithm found no feasible candidate, and in a drivable experiment beside another.
+        representative: index in `runs` of the replica with the largest hypervolume, which pictures
+            of single runs show (the paper's 'best-performing run').
+        best: the trajectory selected from the representative replica's polished front, or else from
+            its front. None if that front is empty, and in a drivable experiment beside another one.
     """
 
     name: str
@@ -104,7 +106,7 @@ class AlgorithmRuns:
 
     @property
     def shown(self) -> ReportRun:
-        """The representative run."""
+        """The replica with the largest hypervolume."""
         return self.runs[self.representative]
 
 
@@ -114,11 +116,12 @@ class Experiment:
 
     Attributes:
         workcell: the cell.
-        files: its files.
+        files: the workcell file and all files that it names.
         objectives: names of the search's objectives.
         summary: the content of summary.json.
-        algorithms: in the campaign's order.
-        union: of a drivable experiment the polished union of all fronts, None without a polish.
+        algorithms: the algorithms in the order of the campaign.
+        union: in a drivable experiment the polished union of all fronts, else None, as without a
+            polish.
     """
 
     workcell: Workcell
@@ -130,22 +133,24 @@ class Experiment:
 
     @property
     def force_kind(self) -> ForceKind:
-        """Kind of forces that limits and drivable fronts are about."""
+        """Kind of normal forces, planned or robust, that force limits and drivable fronts refer
+        to."""
         return force_kind(self.objectives)
 
     @property
     def solved(self) -> tuple[AlgorithmRuns, ...]:
-        """The algorithms that found a feasible candidate."""
+        """The algorithms whose representative replica found a feasible candidate."""
         return tuple(a for a in self.algorithms if len(a.shown.front))
 
     @property
     def has_hybrid(self) -> bool:
-        """True if fronts were polished."""
+        """True if any front was polished."""
         return any(run.hybrid is not None for a in self.algorithms for run in a.runs)
 
     def fronts(self) -> Iterator[tuple[LineStyle, Front, bool]]:
-        """Return the fronts of the representative runs: each with its look, and True if its
-        polished front follows; then the polished union."""
+        """Yield the fronts of each algorithm's representative replica, then the polished union,
+        each as (look, front, replaced); replaced is True for a front of which a polished one
+        follows."""
         for algorithm in self.solved:
             found = algorithm.shown.fronts
             after = found[-1] if self.union is None else self.union
@@ -154,30 +159,32 @@ class Experiment:
             yield series(len(self.algorithms)), self.union, False
 
     def driven(self, objectives: Array) -> Array:
-        """Return (k, 2) force [N] and duration [s] of a drivable experiment's objectives (k, 2)."""
+        """Convert objectives (k, 2) of a drivable experiment, scaled duration and force, to force
+        [N] and duration [s] (k, 2)."""
         reference = float(self.workcell.task.reference_force.max())
         return objectives[:, ::-1] * [reference, duration_unit(self.workcell)]
 
 
 @dataclass(frozen=True)
 class ReportData(Experiment):
-    """Content of a report: the first experiment, and everything beside it.
+    """Everything that a report shows: the first experiment of a study, with its cell, carries,
+    timings and jobs.
 
     Attributes:
         root: the results folder.
         geometry: the cell's collision bodies and pairs.
-        objective_titles: for axes.
-        at_rest: (2,) the first two objectives of the level payload at rest; None where they have
-            no such values.
+        objective_titles: names of the objectives for axes.
+        at_rest: (2,) the first two objectives of the level payload at rest; None if these are other
+            objectives than both robots' forces.
         initial: the hand-made trajectory.
-        timings: of the hand-made and the selected trajectories by label, as `carries` has them.
-        reach: where the arms reach, None in a report without the paper's pictures.
+        timings: the label and the timings of each trajectory in `carries`.
+        reach: the regions that the arms reach, None in a report without the paper's pictures.
         drivable: the drivable experiment, None without one.
-        recommended: decision vector of the carry to run, None without one.
-        jerk: what limits on jerk cost the selected carries and the recommended one, None without
-            limits.
-        branches: how the start branches were decided, None where the workcell decides them.
-        simulations: of the carries that were driven in the simulated cell, empty without.
+        recommended: (n_var,) decision vector of the carry to run, None without one.
+        jerk: table of what limits on jerk cost the selected carries and the recommended one, None
+            without such limits.
+        branches: how the start branches were chosen, None where the workcell file states them.
+        simulations: the carries that were driven in the simulated cell, empty without any.
         jobs: the whole jobs around the recommended and the hand-made trajectory.
     """
 
@@ -197,35 +204,37 @@ class ReportData(Experiment):
 
     @property
     def alone(self) -> bool:
-        """True if the first experiment is the drivable one."""
+        """True if the first experiment is itself the drivable one."""
         return is_drivable(self.workcell, self.objectives)
 
     @property
     def carries(self) -> tuple[DrawnCarry, ...]:
-        """The initial trajectory and each algorithm's best selected one."""
+        """The hand-made trajectory and the selected trajectory of each algorithm that has one."""
         return (self.initial, *(a.best for a in self.algorithms if a.best is not None))
 
     @property
     def drawn(self) -> tuple[DrawnCarry, ...]:
-        """These, and the recommended carry as robots drive it."""
+        """The trajectories of `carries`, and the recommended carry as robots drive it."""
         recommended = self.recommended_carry
         return self.carries if recommended is None else (*self.carries, recommended)
 
     def job(self, label: str) -> DrawnJob | None:
-        """Return the job around the carry of a label, None if it is not planned."""
+        """Return the job around the carry with this label, None if the report has none."""
         return next((job for job in self.jobs if job.label == label), None)
 
     @property
     def recommended_carry(self) -> DrawnCarry | None:
-        """The recommended carry as robots drive it, None where they cannot."""
+        """The recommended carry as robots drive it, None if they cannot drive it or none is
+        recommended."""
         job = self.job(RECOMMENDED_LABEL)
         carry = None if job is None or job.timing is None else job.timing.carry
         return None if carry is None else DrawnCarry(RECOMMENDED_LABEL, carry, RECOMMENDED_STYLE)
 
     @property
     def recommended_objectives(self) -> Array | None:
-        """(2,) the first two objectives of the recommended carry as robots drive it; None where
-        they are neither both robots' forces nor time and force."""
+        """(2,) the first two objectives of the recommended carry as robots drive it. None without a
+        recommendation, and where the objectives are neither both robots' forces nor duration and
+        force."""
         found, reference = self.summary.recommendation, self.workcell.task.reference_force
         if found is not None and self.objectives[:2] == PAPER_OBJECTIVES:
             return np.asarray(found.peak_force / reference)
@@ -238,12 +247,13 @@ class ReportData(Experiment):
 def gather(
     results: CampaignResults, workers: Workers | None = None, paper: bool = True
 ) -> ReportData:
-    """Evaluate the drawn carries in detail.
+    """Read the results of a study, evaluate the carries that the report draws, and plan the jobs
+    around two of them.
 
     Args:
-        results: of a finished study.
-        workers: make the calls that take long, None for this process.
-        paper: whether the paper's pictures are drawn, too.
+        results: folder of the finished study.
+        workers: processes for the slow calls, None for this process.
+        paper: whether the paper's pictures will be drawn too.
 
     Raises:
         ResultsError: the folder is not complete or damaged.
@@ -301,7 +311,11 @@ def gather(
 
 
 def gather_carries(root: Path) -> tuple[CellGeometry, tuple[DrawnCarry, ...]]:
-    """Collect the cell, the hand-made trajectory and every algorithm's best selected one.
+    """Return the geometry of a study's cell, and its carries: the hand-made trajectory and the
+    selected one of each algorithm that has one.
+
+    Args:
+        root: the results folder.
 
     Raises:
         ResultsError: the folder is not complete or damaged.
@@ -313,7 +327,8 @@ def gather_carries(root: Path) -> tuple[CellGeometry, tuple[DrawnCarry, ...]]:
 
 
 def _experiment(results: CampaignResults, select: bool = True) -> Experiment:
-    """Build an experiment, with its best trajectories selected on request."""
+    """Read an experiment. With `select` a trajectory is selected from the representative replica of
+    each algorithm."""
     summary, fronts = read_summary(results.root), results.fronts
     union = next((front for front in fronts if front.algorithm == UNION), None)
     evaluator = results.cell.evaluator if select else None
@@ -345,7 +360,8 @@ def _hand_made(evaluator: CandidateEvaluator) -> DrawnCarry:
 
 
 def _titles(results: CampaignResults) -> tuple[str, ...]:
-    """Return the objectives' titles, with the robots' names for their numbers."""
+    """Return the objectives' names for axes, in which the robots' names replace 'robot 1' and
+    'robot 2'."""
     titles = [OBJECTIVES[name].title for name in results.objectives]
     for i, robot in enumerate(results.workcell.robots):
         titles = [title.replace(f"robot {i + 1}", robot.name) for title in titles]

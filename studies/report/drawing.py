@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from hybrid_opt.timing.robustness import PayloadSensitivity
 
 FULL_WIDTH = 180.0 / 25.4
-"""Text width of a journal page [inch]."""
+"""Width of the text on a journal's page [inch]."""
 
 PNG_DPI = 200
 
@@ -67,7 +67,8 @@ RC: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class LineStyle:
-    """How one trajectory or algorithm is drawn everywhere."""
+    """Colour, line, marker and hatch with which one trajectory or algorithm is drawn in all
+    pictures."""
 
     colour: str
     line: Any
@@ -76,12 +77,17 @@ class LineStyle:
 
     @property
     def drawn(self) -> dict[str, Any]:
-        """Keywords of a line, for Matplotlib."""
+        """Matplotlib's keyword arguments for a line in this style."""
         return {"color": self.colour, "linestyle": self.line}
 
     def marks(self, size: float, edge: str = "black", opened: bool = False) -> dict[str, Any]:
-        """Return Matplotlib's keywords of marks without a line; open ones have a coloured edge
-        alone."""
+        """Return Matplotlib's keyword arguments for markers without a line.
+
+        Args:
+            size: of the markers [points].
+            edge: colour of the markers' edges.
+            opened: True for markers without filling, with edges in the colour of the style.
+        """
         return {
             "marker": self.marker,
             "linestyle": "none",
@@ -94,13 +100,13 @@ class LineStyle:
 
 
 MARKED = "#b00020"
-"""Colour of what stands out."""
+"""Colour of what a picture points at: the recommended carry and colliding bodies."""
 
 HAND_MADE_STYLE = LineStyle("#555555", ":", "s", "....")
-"""Style of the hand-made trajectory."""
+"""Line style of the hand-made trajectory."""
 
 RECOMMENDED_STYLE = LineStyle(MARKED, "-", "*", "")
-"""Style of the recommended carry."""
+"""Line style of the recommended carry."""
 
 SERIES = (
     LineStyle("#0072B2", "-", "o", ""),
@@ -109,7 +115,8 @@ SERIES = (
     LineStyle("#CC79A7", (0, (5, 1, 1, 1, 1, 1)), "v", "\\\\\\\\"),
     LineStyle("#D55E00", (0, (1, 1)), "P", "++++"),
 )
-"""Styles of the algorithms in order (Okabe and Ito's colours, distinct for the colour-blind)."""
+"""Line styles of the algorithms in the order of a campaign, in colours by Okabe and Ito that
+colour-blind readers can tell apart."""
 
 PAYLOAD_COLOUR = "#c9a227"
 OBSTACLE = "#9aa3ab"
@@ -117,30 +124,30 @@ GROUND_COLOUR = "#e8e8e4"
 
 
 def series(index: int) -> LineStyle:
-    """Return the style of the algorithm at a position."""
+    """Return the line style of the algorithm with this index in a campaign."""
     return SERIES[index % len(SERIES)]
 
 
 def shortened(name: str, length: int = 24) -> str:
-    """Shorten a name of the workcell to fit a label."""
+    """Cut a name of the workcell file to `length` characters, the last one an ellipsis."""
     return name if len(name) <= length else f"{name[: length - 1]}\N{HORIZONTAL ELLIPSIS}"
 
 
 def new_figure(share: float) -> Figure:
-    """Create an empty figure as wide as a journal's page, its height a share of that; draw it
-    inside `in_style`."""
+    """Create an empty figure as wide as a journal's page, with a height of `share` times the width.
+    Call and draw it inside `in_style`."""
     return Figure(figsize=(FULL_WIDTH, share * FULL_WIDTH), layout="constrained")
 
 
 @contextmanager
 def in_style() -> Iterator[None]:
-    """Draw with the common style in the `with` block."""
+    """Apply the common style of all figures inside the `with` block."""
     with mpl.rc_context(RC):
         yield
 
 
 def settled(figure: Figure) -> Figure:
-    """Fix the figure's layout, so that all its files show the same."""
+    """Compute the layout of a figure and fix it, so that all files of the figure look the same."""
     with in_style():
         engine = figure.get_layout_engine()
         assert engine is not None
@@ -153,33 +160,36 @@ def settled(figure: Figure) -> Figure:
 
 
 def legend_below(figure: Figure, axes: Axes, columns: int = 0) -> None:
-    """Draw the legend of a panel below the whole figure, in one row unless columns are given."""
+    """Draw the legend of one panel below the whole figure, in one row unless the number of columns
+    is given."""
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=columns or len(handles))
 
 
 def limit_line(axes: Axes, level: float, label: str, across: bool = True) -> None:
-    """Draw a limit as a dashed line, across or up the panel."""
+    """Draw a limit as a dashed line: horizontal at y = `level`, or vertical at x = `level` if not
+    `across`."""
     draw = axes.axhline if across else axes.axvline
     draw(level, color="black", linestyle="--", linewidth=0.9, label=label)
 
 
 def rest_line(axes: Axes, level: float, label: str) -> None:
-    """Draw the static forces as a line across the panel."""
+    """Draw the force of the payload at rest as a horizontal line at y = `level`."""
     axes.axhline(level, color="black", linewidth=0.8, linestyle=(0, (7, 2, 1, 2)), label=label)
 
 
 def panel_label(axes: Axes, letter: str, text: str, bare: bool = False) -> None:
-    """Write '(a) text' above a panel's left corner.
+    """Write '(letter) text' above the left corner of a panel.
 
     Args:
-        bare: whether nothing else is above the panel: to look for it takes half of a layout.
+        bare: True if nothing else stands above the panel. It saves Matplotlib a search that takes
+            half the time of a layout.
     """
     axes.set_title(f"({letter}) {text}", loc="left", y=1.0 if bare else None)
 
 
 def files_of(figure: Figure, pdf: bool = True) -> dict[str, bytes]:
-    """Return a settled figure as files, by suffix: PNG, and PDF on request."""
+    """Return the contents of a settled figure's files by suffix: 'png', and 'pdf' if wanted."""
     wanted = {"png": {"Software": None}} | ({"pdf": {"CreationDate": None}} if pdf else {})
     files = {}
     with in_style():
@@ -191,7 +201,7 @@ def files_of(figure: Figure, pdf: bool = True) -> dict[str, bytes]:
 
 
 def save(figure: Figure, folder: Path, name: str, pdf: bool = True) -> tuple[Path, ...]:
-    """Write a settled figure as PNG, and as PDF where it is wanted; returns the files."""
+    """Write a settled figure as PNG, and as PDF if wanted, to `folder`; return the paths."""
     paths = []
     for suffix, content in files_of(figure, pdf).items():
         paths.append(folder / f"{name}.{suffix}")
@@ -200,20 +210,21 @@ def save(figure: Figure, folder: Path, name: str, pdf: bool = True) -> tuple[Pat
 
 
 MAX_EDGE = 0.12
-"""Faces are cut to this size, so that sorting them by their middle is right [m]."""
+"""Longest edge of drawn triangles [m]; larger ones are cut, so that sorting triangles by their
+middle draws them in the right order."""
 
 LIGHT = np.array([-0.45, 0.35, 0.82]) / np.linalg.norm([-0.45, 0.35, 0.82])
 
 
 @dataclass(frozen=True)
 class DrawnCarry:
-    """One judged trajectory under the search's timing.
+    """One judged trajectory and how pictures draw it.
 
     Attributes:
-        label: in legends.
-        timed: the trajectory.
-        look: of its lines.
-        source: whose it is, with its replica where there are several.
+        label: name in legends.
+        timed: the trajectory under the timing that pictures show.
+        look: style of its lines.
+        source: the search that found it, with its replica where there are several.
     """
 
     label: str
@@ -228,7 +239,7 @@ class DrawnCarry:
 
     @cached_property
     def sensitivity(self) -> PayloadSensitivity:
-        """Its forces against the payload's mass."""
+        """Contact forces of the unchanged motion against the payload's mass."""
         # Not imported at the top: pictures of a cell need no timing.
         from hybrid_opt.timing.robustness import payload_sensitivity
 
@@ -237,12 +248,13 @@ class DrawnCarry:
 
 @dataclass(frozen=True)
 class View:
-    """A camera at infinity.
+    """A direction of parallel projection, as from an infinitely far camera.
 
     Attributes:
-        right, up: (3,) unit vectors of the picture in the world.
-        x_label, y_label: of the axes, '' where the picture's axes are not the world's.
-        mirrored: whether the horizontal axis runs to the left in the world's coordinate.
+        right, up: (3,) unit vectors in the world frame that point to the right and up in the
+            picture.
+        x_label, y_label: titles of the picture's axes; '' where they are not axes of the world.
+        mirrored: True if the world coordinate on the horizontal axis increases to the left.
     """
 
     right: Array
@@ -253,25 +265,26 @@ class View:
 
     @property
     def towards(self) -> Array:
-        """(3,) unit vector from the scene to the eye."""
+        """(3,) unit vector from the scene to the viewer, in the world frame."""
         return np.cross(self.right, self.up)
 
     def flat(self, points: Array) -> Array:
-        """Return (..., 2) picture coordinates of world points (..., 3)."""
+        """Project points (..., 3) of the world to picture coordinates (..., 2) [m]."""
         return np.stack([points @ self.right, points @ self.up], axis=-1)
 
 
 _X, _Y, _Z = np.eye(3)
 
 FRONT_VIEW = View(-_Y, _Z, "y [m]", "z [m]", mirrored=True)
-"""View from -x, as one stands before the rack."""
+"""View along the x axis from negative x, as a person stands before the rack."""
 
 SIDE = View(_X, _Z, "x [m]", "z [m]")
-"""View from -y."""
+"""View along the y axis from negative y."""
 
 
 def oblique(azimuth: float, elevation: float) -> View:
-    """Return a view from a direction: azimuth about z from +x, elevation above the ground [rad]."""
+    """Return the view of a viewer in the given direction from the scene: azimuth about z from +x,
+    and elevation above the horizontal [rad]."""
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     towards = np.array(
         [
@@ -284,12 +297,13 @@ def oblique(azimuth: float, elevation: float) -> View:
 
 
 ISOMETRIC = oblique(np.deg2rad(-152.0), np.deg2rad(26.0))
-"""View from -x, a little to the right and above."""
+"""View from negative x, a little from the right and from above."""
 
 
 @dataclass(frozen=True)
 class Faces:
-    """Triangles in the frame of a solid, cut to size, with what colours them."""
+    """Triangles of one solid, cut to at most `MAX_EDGE`: vertices (k, 3, 3) [m] and normals (k, 3)
+    in the solid's frame, and their colour."""
 
     frame: Frame
     triangles: Array
@@ -300,7 +314,7 @@ class Faces:
 
 @dataclass(frozen=True)
 class CutCell:
-    """A cell, and the faces of it that are drawn."""
+    """The geometry of a cell, with the cut triangles of the solids that are drawn."""
 
     geometry: CellGeometry
     faces: tuple[Faces, ...]
@@ -309,8 +323,8 @@ class CutCell:
     def of(
         cls, geometry: CellGeometry, solids: Sequence[Solid], marked: Collection[str] = ()
     ) -> CutCell:
-        """Cut some of the cell's solids to triangles of at most `MAX_EDGE`, coloured by group,
-        those of the marked names in red."""
+        """Cut solids of the cell into triangles with edges of at most `MAX_EDGE`. The colour of a
+        solid depends on its group; those with a name in `marked` are red."""
         corners = [solid.vertices[solid.faces] for solid in solids]
         numbers = np.repeat(np.arange(len(solids)), [len(each) for each in corners])
         limits = np.array([np.inf if solid.is_ground else MAX_EDGE for solid in solids])
@@ -328,8 +342,16 @@ class CutCell:
 
 
 def _cut(corners: Array, of: NDArray[np.intp], limits: Array) -> tuple[Array, NDArray[np.intp]]:
-    """Halve triangles (n, 3, 3) across their longest edges until none exceeds the limit of its
-    solid; return them and the indices of their solids. Neighbours share the places of their cuts.
+    """Halve triangles across their longest edges until no edge is longer than the limit of its
+    solid. Triangles with a common edge are cut at the same place.
+
+    Args:
+        corners: (n, 3, 3) vertices [m].
+        of: (n,) index of each triangle's solid.
+        limits: longest edge per solid [m].
+
+    Returns:
+        Vertices (k, 3, 3) of the small triangles, and (k,) indices of their solids.
     """
     while True:
         lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
@@ -359,7 +381,13 @@ def draw_cell(
     q: Array,
     hidden: tuple[str, ...] = (),
 ) -> None:
-    """Draw the cell at one sample: pose (6,), q (12,). hidden: kinds of frames left out."""
+    """Draw the cell at one sample.
+
+    Args:
+        pose: (6,) pose of the box [m, rad].
+        q: (12,) joint positions of both arms [rad].
+        hidden: kinds of frames whose solids are left out.
+    """
     placed = frame_placements(cell.geometry, pose[None], q[None])
     corners, colours = [], []
     ground_corners = []
@@ -399,19 +427,20 @@ def draw_cell(
 
 
 def _polygons(flat: Array, **style: Any) -> PolyCollection:
-    """Return polygons (n, k, 2) unchanged: Matplotlib takes one array faster than the sequence of
-    its stubs."""
+    """Return a Matplotlib collection of polygons (n, k, 2). It exists because Matplotlib's type
+    stubs do not know that one array is accepted, which is faster."""
     return PolyCollection(flat, **style)  # type: ignore[arg-type]
 
 
 def draw_path(axes: Axes, view: View, points: Array, **style: object) -> None:
-    """Draw a line through world points (n, 3), above the bodies."""
+    """Draw a line through points (n, 3) of the world, in front of all bodies."""
     flat = view.flat(points)
     axes.plot(flat[:, 0], flat[:, 1], zorder=4.0, **style)  # type: ignore[arg-type]
 
 
 def draw_box_edges(axes: Axes, view: View, lower: Array, upper: Array, **style: object) -> None:
-    """Draw the twelve edges of a box along the world axes."""
+    """Draw the twelve edges of the axis-aligned box between two opposite corners (3,) in the
+    world."""
     flat = view.flat(box_corners(lower, upper))
     # Corners whose numbers differ in one bit are neighbours.
     edges = [flat[[i, i | bit]] for i in range(8) for bit in (1, 2, 4) if not i & bit]
@@ -419,11 +448,12 @@ def draw_box_edges(axes: Axes, view: View, lower: Array, upper: Array, **style: 
 
 
 MARGIN = 0.06
-"""Of a picture around what it shows [m]."""
+"""Free margin around the content of a picture of the cell [m]."""
 
 
 def frame_axes(axes: Axes, view: View, points: Array, margin: float = MARGIN) -> None:
-    """Fit the limits to world points (n, 3) at equal scales; world axes get labels."""
+    """Set the limits of a picture to contain points (n, 3) of the world, with equal scales and a
+    margin [m]. The axes get titles if the view has any, else they are hidden."""
     flat = view.flat(points)
     lower, upper = flat.min(axis=0) - margin, flat.max(axis=0) + margin
     axes.set_xlim(lower[0], upper[0])
@@ -444,11 +474,12 @@ def _negated(value: float, _: object) -> str:
 
 
 def aspect(view: View, points: Array) -> float:
-    """Compute width over height of world points (n, 3) in a view."""
+    """Return the width of points (n, 3) of the world over their height, both in the picture of a
+    view."""
     width, height = np.ptp(view.flat(points), axis=0)
     return float(width / height)
 
 
 def box_corners(lower: Array, upper: Array) -> Array:
-    """Return the corners (8, 3) of a box along the world axes."""
+    """Return the 8 corners (8, 3) of the axis-aligned box between two opposite corners (3,)."""
     return np.array(list(product(*zip(lower, upper, strict=True))))

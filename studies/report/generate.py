@@ -45,7 +45,7 @@ from studies.study.tables import margins, study_tables, timings
 from symbolic.contact.registry import contact_model
 
 PICTURE_COLOURS = 160
-"""Colours of a picture on the page; its file's are reduced to them."""
+"""Number of colours to which a picture on the page is reduced; the picture's own file keeps all."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class ReportPicture:
     Attributes:
         name: of its files, without suffix.
         caption: one or two sentences of plain text.
-        make: draws it, without style.
+        make: function that draws the figure; it sets no style.
     """
 
     name: str
@@ -63,21 +63,21 @@ class ReportPicture:
     make: Callable[[], Figure]
 
     def draw(self) -> Figure:
-        """Draw the figure in the common style."""
+        """Return the figure, drawn in the common style and with a fixed layout."""
         with in_style():
             return settled(self.make())
 
 
 def _of(name: str, draw: Callable[..., Figure], *given: Any, caption: str = "") -> ReportPicture:
-    """Build a picture whose caption is the docstring of its drawing function without 'Draw', unless
-    one is given."""
+    """Return the picture that `draw` makes of the arguments in `given`. Without a caption, the
+    docstring of `draw` without the word 'Draw' becomes the caption."""
     text = " ".join((caption or inspect.getdoc(draw) or "").removeprefix("Draw ").split())
     return ReportPicture(name, text[:1].upper() + text[1:], partial(draw, *given))
 
 
 def report_pictures(data: ReportData) -> Iterator[ReportPicture]:
-    """Yield all pictures that the data allows: of the recommended carry, then the paper's in its
-    order."""
+    """Yield all pictures that the data suffices for: those of the recommended carry, then the
+    paper's in the order of the paper."""
     yield from _first_pictures(data)
     if data.reach is not None:
         yield from _paper_pictures(data, data.reach)
@@ -144,10 +144,14 @@ def _search_pictures(data: ReportData) -> Iterator[ReportPicture]:
 def make_report(
     root: Path, settings: Mapping[str, bool], progress: Progress, workers: Workers
 ) -> None:
-    """Write the report of a results folder.
+    """Write the report of a finished study into its results folder.
 
     Args:
-        settings: as `write_report` has them, and `paper`: whether the paper's pictures are drawn.
+        root: the results folder.
+        settings: arguments `with_paper` and `pdf` of `write_report` by name, and `paper`: whether
+            the paper's pictures are drawn.
+        progress: shows the progress.
+        workers: processes that draw.
 
     Raises:
         DualArmError: the folder is not complete, or cannot be written.
@@ -165,13 +169,15 @@ def write_report(
     progress: Progress | None = None,
     workers: Workers | None = None,
 ) -> None:
-    """Write all files of the report.
+    """Write all files of the report into a results folder: pictures, tables and the page.
 
     Args:
-        with_paper: whether figures that the paper states of its rack stand beside ours.
-        pdf: whether pictures are also written as PDF, which takes as long as to draw them.
-        progress: where to show it.
-        workers: draw, None for this process.
+        root: the results folder.
+        data: what the report shows.
+        with_paper: whether tables have rows with the values that the paper states of its own rack.
+        pdf: whether pictures are also written as PDF, which takes as long as drawing them.
+        progress: shows the progress, None to show nothing.
+        workers: processes that draw, None for this process.
 
     Raises:
         ResultsError: the folder cannot be written.
@@ -201,11 +207,13 @@ def write_report(
 
 
 FIRST_TABLES = ("time_against_force", "robust_price", "simulation", "phases")
-"""Tables of what is recommended, which the page shows before those of the paper's experiment."""
+"""Names of the tables about the recommended carry, which the page shows before those of the paper's
+experiment."""
 
 
 def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
-    """Return all tables of a report, see `study_tables`."""
+    """Return all tables of a report: those of `study_tables`, the timings, the phases of the jobs,
+    and the margins."""
     beside = None if data.drivable is None or data.alone else data.drivable.summary
     found = list(study_tables(data.summary, beside, data.jerk, data.simulations, with_paper))
     robots = data.summary.robots
@@ -221,12 +229,13 @@ def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
 
 
 def _listed(data: ReportData) -> list[ReportPicture]:
-    """Return all pictures without drawing them; the context of a worker's calls."""
+    """Return all pictures of a report, not yet drawn."""
     return list(report_pictures(data))
 
 
 def _drawn(data: bytes, pdf: bool, index: int) -> dict[str, bytes]:
-    """Draw a picture of pickled data; returns its files by suffix."""
+    """Draw the picture with this index of a report, whose data is pickled. Return the contents of
+    the files by suffix."""
     return files_of(_unpickled(data)[index].draw(), pdf)
 
 
@@ -238,12 +247,13 @@ def _unpickled(data: bytes) -> list[ReportPicture]:
 def render_page(
     data: ReportData, document: dict[str, Any], tables: Sequence[Table], pictures: Sequence[str]
 ) -> str:
-    """Return the page's text.
+    """Return the text of the report's HTML page.
 
     Args:
-        document: data of its scripts, from `page_data`.
-        tables: all of the report.
-        pictures: as HTML, in the order of `report_pictures`.
+        data: what the report shows.
+        document: JSON values for the page's scripts, from `page_data.page_document`.
+        tables: all tables of the report.
+        pictures: pictures as HTML, in the order of `report_pictures`.
     """
     texts = files("studies.report") / "page"
     boot, own = ((texts / name).read_text("utf-8") for name in ("boot.js", "page.js"))
@@ -278,7 +288,8 @@ def _tables(tables: Sequence[Table], of_paper: bool) -> str:
 
 
 def _paper_text(data: ReportData) -> str:
-    """Say where the paper's pictures are, or how to draw them."""
+    """Return a paragraph of HTML that says where the paper's pictures are, or which command draws
+    them."""
     if data.reach is not None:
         return (
             "<p>The same pictures lie beside this page in the folder <code>figures</code>: as PNG "
@@ -292,14 +303,15 @@ def _paper_text(data: ReportData) -> str:
 
 
 def _block(text: str, attributes: str = "") -> str:
-    """Compress a text that `boot.js` unpacks, without its creation time."""
+    """Return a script element that holds a compressed text, which `boot.js` of the page unpacks.
+    Equal texts give equal elements."""
     content = base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
     return f"<script type='application/gzip'{attributes}>{content}</script>"
 
 
 def _policy(scripts: list[str]) -> str:
-    """Return the content security policy: these inline scripts, styles and pictures of the page, no
-    request."""
+    """Return a content security policy that allows exactly these inline scripts, inline styles and
+    embedded pictures, and no network requests."""
     hashes = [
         base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts
     ]
@@ -347,7 +359,8 @@ def _facts(data: ReportData) -> str:
 
 
 def _assumed(data: ReportData) -> str:
-    """State which pads the forces of both experiments assume."""
+    """Return one or two sentences that say which kind of contact the forces of each experiment
+    assume."""
     said = f"The forces of this experiment are of {contact_model(data.workcell).assumption}."
     if data.drivable is None:
         return said

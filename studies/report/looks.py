@@ -40,21 +40,21 @@ FRAME_SIZE = (6.4, 4.0)
 
 DPI = 100
 HOLD_SECONDS = 0.7
-"""The last frame stays so long before a GIF begins anew."""
+"""Time that a GIF rests at its last frame before it starts again [s]."""
 
 GIF_COLOURS = 128
-"""Colours of a GIF's palette."""
+"""Number of colours in a GIF's palette."""
 
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """A motion to be shown.
+    """A motion of the cell to be animated.
 
     Attributes:
-        label: text above it.
-        time: (n,) [s].
-        pose: (n, 6) of the box [m, rad].
-        q: (n, all joints) of both arms side by side [rad].
+        label: text above the picture.
+        time: (n,) times of the samples [s].
+        pose: (n, 6) pose of the box [m, rad].
+        q: (n, joints) joint positions of both arms side by side [rad].
     """
 
     label: str
@@ -64,7 +64,7 @@ class Film:
 
     @classmethod
     def of(cls, carry: DrawnCarry) -> Film:
-        """Build the film of a carry as planned."""
+        """Return the film of a carry in its planned timing."""
         return cls(carry.label, carry.timed.time, carry.timed.pose, carry.timed.q)
 
     @property
@@ -74,12 +74,17 @@ class Film:
 
 
 def follow_looks(root: Path, options: argparse.Namespace) -> None:
-    """Show a study as the options of `studies.options.add_looks` state: write an animation of the
-    best selected trajectory of the first algorithm that has one; serve the report until Ctrl-C, or
-    without a report a page that plays that trajectory.
+    """Show a study in the ways that the command line requests: write an animation of the first
+    selected trajectory, or of the hand-made one if none was selected; and serve until Ctrl-C the
+    report, or a page that plays the last selected trajectory if there is no report.
+
+    Args:
+        root: the results folder.
+        options: parsed options of `studies.options.add_looks`.
 
     Raises:
-        DualArmError: the results, a suffix or a library do not fit, or no port is free.
+        DualArmError: the results are incomplete, the animation's suffix is unknown, a library is
+            missing, or no port is free.
     """
     if options.animation:
         geometry, carries = gather_carries(root)
@@ -95,7 +100,7 @@ def follow_looks(root: Path, options: argparse.Namespace) -> None:
 
 
 def write_animation(geometry: CellGeometry, film: Film, path: Path) -> None:
-    """Write a motion in real time; the suffix decides the format, .gif or .mp4.
+    """Write an animation in real time to `path`; the suffix, .gif or .mp4, decides the format.
 
     Raises:
         ReportError: the suffix is another, or the MP4 writer is not installed.
@@ -109,7 +114,7 @@ def write_animation(geometry: CellGeometry, film: Film, path: Path) -> None:
 
 
 def frames(geometry: CellGeometry, film: Film) -> Iterator[NDArray[np.uint8]]:
-    """Draw pictures (height, width, 3), evenly spaced in time."""
+    """Yield the pictures (height, width, 3) of an animation, evenly spaced in time."""
     cell = CutCell.of(geometry, cell_solids(geometry))
     points = motion_points(geometry, film.pose, film.q)
     count = max(2, round(film.duration * FRAMES_PER_SECOND) + 1)
@@ -171,7 +176,8 @@ HOST = "127.0.0.1"
 
 
 def page_of(root: Path) -> bytes:
-    """Return the page of a results folder.
+    """Return the HTML page of the results folder `root`, encoded: the report, or a page that plays
+    the last selected trajectory if there is no report.
 
     Raises:
         DualArmError: the results are incomplete.
@@ -183,8 +189,8 @@ def page_of(root: Path) -> bytes:
 
 
 def page_server(page: bytes, port: int) -> ThreadingHTTPServer:
-    """Open the server of a page for a browser of this machine, at a port, or at another free one if
-    that is in use.
+    """Return a server that answers browsers of this machine with a page, at the given port or at
+    any free one if it is in use.
 
     Raises:
         ReportError: no port is free.
@@ -194,7 +200,7 @@ def page_server(page: bytes, port: int) -> ThreadingHTTPServer:
         """Answers every request with the page."""
 
         def do_GET(self) -> None:
-            """See `BaseHTTPRequestHandler`."""
+            """Answer a GET request with the page."""
             self.send_response(200)
             self.send_header("Content-Type", "text/html; charset=utf-8")
             self.send_header("Content-Length", str(len(page)))
@@ -202,7 +208,7 @@ def page_server(page: bytes, port: int) -> ThreadingHTTPServer:
             self.wfile.write(page)
 
         def log_message(self, *_: object) -> None:
-            """Say nothing of requests."""
+            """Write no log of requests."""
 
     for number in (port, 0):
         try:

@@ -11,7 +11,8 @@ from studies.study.recommendation import StoredRecommendation
 
 
 def answer_html(data: ReportData) -> str:
-    """Return the recommendation, '' where a study has neither one nor a reason."""
+    """Return the recommendation, or the reason why there is none, as HTML; '' for a study without
+    both."""
     found = data.summary.answer("")
     if found is None:
         return ""
@@ -38,7 +39,8 @@ def _tile(fact: Fact, choice: StoredRecommendation | None) -> str:
 
 
 def _bar(choice: StoredRecommendation) -> str:
-    """Draw the force and its contributions as a bar up to the allowed one."""
+    """Return HTML of a bar that shows the commanded force, divided into its contributions, beside
+    the allowed force."""
     allowed = choice.force if choice.allowed is None else float(choice.allowed[1 - LEADER])
     whole = max(allowed, choice.force)
     parts = "".join(
@@ -59,7 +61,7 @@ def _bar(choice: StoredRecommendation) -> str:
 
 
 LISTED = 3
-"""Most parts of the force that stand below its bar, the largest first."""
+"""Most contributions to the force that are listed below the bar, the largest first."""
 
 
 def _command(fact: Fact) -> str:

@@ -37,29 +37,30 @@ from symbolic.records import Workcell
 
 RECOMMENDED_LABEL = "recommended"
 RECOMMENDED_TITLE = "Recommended"
-"""The carry to run, in lists and pictures of the page."""
+"""Name of the recommended carry in lists and pictures of the page."""
 
 CARRY_SAMPLES = 40
 PAGE_PHASE_SAMPLES = 7
-"""Samples of the carry, and of every other phase, for a motion on the page."""
+"""Number of samples that the page gets of the carry of a job, and of each other phase."""
 
 WITHOUT_JERK = "; its carry without the limits on jerk, which an export keeps"
 
 HELD = ("lift", "carry", "set_down")
-"""Phases in which the pads alone hold the box."""
+"""Names of the phases in which the pads alone hold the box."""
 
 
 @dataclass(frozen=True)
 class DrawnJob:
-    """A job for a report, or the reason why there is none.
+    """The job around a trajectory for a report, or the reason why there is none.
 
     Attributes:
-        label: of its trajectory.
-        problem: reason why it cannot be planned, else ''.
-        job: None if it cannot be planned.
-        remark: origin of its forces, and limits that its timing ignores.
-        timing: of its path, None if that failed.
-        margins: largest errors of the cell's description that the recommended one tolerates.
+        label: name of the trajectory.
+        problem: why no job can be planned, '' if one is.
+        job: the planned job, None if there is none.
+        remark: how the commanded forces were chosen, and which limits the timing ignores.
+        timing: timing of the trajectory, None if that failed.
+        margins: largest errors of the cell's description that the commanded forces tolerate; only
+            of the recommended carry.
     """
 
     label: str
@@ -71,7 +72,12 @@ class DrawnJob:
 
 
 def recommended_job(x: Array, cells: Sequence[ReadyCell]) -> DrawnJob:
-    """Plan the job around the recommended carry x (n_var,) of the last cell, as robots drive it."""
+    """Plan the job around the recommended carry as robots drive it.
+
+    Args:
+        x: (n_var,) decision vector of the carry.
+        cells: cells of the report; the carry belongs to the last one.
+    """
     model = cells[-1].jobs
     found = drawn(model, RECOMMENDED_LABEL, lambda: driven_timing(model.timing, x), True)
     if found.timing is None or found.timing.carry is None:
@@ -80,9 +86,15 @@ def recommended_job(x: Array, cells: Sequence[ReadyCell]) -> DrawnJob:
 
 
 def drawn_job(label: str, x: Array, limits: TimingLimits, cells: Sequence[ReadyCell]) -> DrawnJob:
-    """Plan the job around a path of the first cell, x (n_var,), in the last one: timed within
-    limits, with the default forces of an export, within the cell's limits on jerk, which takes
-    long."""
+    """Plan the job around a path of the first cell, driven in the last cell, with the default
+    forces of an export and within the cell's limits on jerk, which is slow.
+
+    Args:
+        label: name of the trajectory.
+        x: (n_var,) decision vector in the first cell's task.
+        limits: further limits of the timing.
+        cells: cells of the report.
+    """
     model = cells[-1].jobs
     (path,) = resample_decisions(x, cells[0].cell.workcell.task, model.workcell.task)
     return drawn(model, label, lambda: time_path(model.timing, path, limits), True)
@@ -91,8 +103,15 @@ def drawn_job(label: str, x: Array, limits: TimingLimits, cells: Sequence[ReadyC
 def drawn(
     model: JobModel, label: str, timed: Callable[[], Timing], within_jerk: bool = False
 ) -> DrawnJob:
-    """Plan the job around a path that is timed here, also within the cell's limits on jerk if
-    wanted."""
+    """Time a trajectory and plan the job around it. If either fails with a DualArmError, the result
+    holds the message.
+
+    Args:
+        model: plans jobs in the cell.
+        label: name of the trajectory.
+        timed: computes the timing.
+        within_jerk: whether the carry keeps the cell's limits on jerk.
+    """
     timing = None
     try:
         timing = timed()
@@ -105,10 +124,12 @@ def drawn(
 
 
 def job_samples(job: Job) -> Array:
-    """Return samples (k, 11 + joints) of a job: some of each phase, and the peaks of the forces.
+    """Return samples (k, 11 + joints) of a job: some evenly spread in each phase, and those with
+    the largest forces.
 
-    The columns are time [s], box pose, joints, both commanded normal forces, and the
-    `needed_forces` of the force-controlled arm, NaN while the box stands [N].
+    The columns are time [s], pose of the box (6) [m, rad], all joint positions [rad], both
+    commanded normal forces [N], and the two least forces of `needed_forces` [N], which are NaN in
+    phases in which the box stands.
     """
     parts = []
     for phase in job.phases:
@@ -126,23 +147,24 @@ def job_samples(job: Job) -> Array:
 
 
 def needed_forces(workcell: Workcell, motion: BoxMotion) -> Array:
-    """Compute the least normal forces (n, 2) [N] of the force-controlled arm that hold a motion: in
-    every case of the uncertainty, and in the nominal case."""
+    """Return the least normal forces (n, 2) of the force-controlled arm that hold the box during a
+    motion [N]: in every case of the uncertainty (column 0), and in the nominal case (column 1)."""
     model = robust_model(workcell)
     every = model.commanded(motion, workcell.uncertainty, LEADER)
     return np.column_stack([every, model.nominal(motion, LEADER)[:, 1 - LEADER]])
 
 
 def _rows(time: Array, count: int, peaks: Iterable[int]) -> NDArray[np.intp]:
-    """Return rows of samples evenly spread in time, and of peaks."""
+    """Return sorted indices of samples: at most `count` evenly spread in time, the samples in
+    `peaks`, the first and the last."""
     moments = np.linspace(time[0], time[-1], min(len(time), count))
     even = np.searchsorted(time, moments).clip(max=len(time) - 1)
     return np.unique([0, *even, *peaks, len(time) - 1])
 
 
 def _once(table: Array) -> Array:
-    """Remove samples (n, k) whose time, their first number, repeats: where two phases meet, and
-    where an acceleration jumps."""
+    """Remove rows of a table (n, k) whose time, in column 0, equals that of the row before. They
+    occur where two phases meet and where an acceleration jumps."""
     return np.asarray(table[np.concatenate([[True], np.diff(table[:, 0]) > 1e-9])])
 
 
@@ -153,11 +175,12 @@ PHASE_LIMITS = (
     "payload velocity",
     "payload acceleration",
 )
-"""Limits of which every phase states its use."""
+"""Names of the limits for which the table of phases shows how much of each a phase uses."""
 
 
 def phases(jobs: Sequence[DrawnJob], robots: Sequence[str]) -> Table:
-    """Return the phases of whole jobs, with the names of the robots."""
+    """Return the table of the phases of whole jobs: times, largest forces and uses of the limits.
+    `robots` are the names of both robots."""
     rows: list[tuple[str, ...]] = []
 
     def add(
@@ -199,25 +222,26 @@ def phases(jobs: Sequence[DrawnJob], robots: Sequence[str]) -> Table:
 
 
 PAGE_SAMPLES = 60
-"""Samples of a trajectory on the page; its force peaks are kept besides."""
+"""Number of evenly spread samples that the page gets of a trajectory, to which those with extreme
+forces are added."""
 
 DRIVEN_TITLE = "as robots drive it"
 ASSUMED = "as the search assumed"
 WHOLE_JOB = "the whole job"
 
 NO_JOB = "shown of the recommended and the hand-made carry only; an export plans any"
-"""Why a trajectory that can be driven has none."""
+"""Text in place of the whole job of a trajectory for which none is planned."""
 
 
 @dataclass(frozen=True)
 class PageTrajectory:
-    """One trajectory of the page.
+    """One trajectory to be shown on the page.
 
     Attributes:
-        source: whose it is, stored with a saved file.
+        source: the search that found it, as text, stored in a file saved from the page.
         x: (n_var,) decision vector.
-        cell: number of its cell among those of the page.
-        recommended: whether it is the carry to run.
+        cell: index of its cell among the cells of the page.
+        recommended: whether it is the recommended carry.
         job: the whole job around it, None where none is shown.
     """
 
@@ -229,7 +253,8 @@ class PageTrajectory:
 
 
 def _with_job(trajectory: dict[str, Any], found: DrawnJob) -> None:
-    """Add a planned job as one more motion of a trajectory, or say why there is none."""
+    """Add a planned job as one more motion to the JSON values of a trajectory, or the reason why
+    there is none."""
     job, motions = found.job, trajectory["motions"]
     if job is None:
         trajectory["jobProblem"] = found.problem
@@ -264,19 +289,20 @@ def _phase(phase: Phase) -> dict[str, Any]:
 
 
 def _rounded(values: Array, digits: int) -> list[float | None]:
-    """Round values for JSON, which has no NaN."""
+    """Round values to `digits` decimals for JSON; NaN becomes None."""
     return [None if np.isnan(value) else round(value, digits) for value in values.tolist()]
 
 
 def page_trajectory(cells: Sequence[ReadyCell], shown: PageTrajectory) -> dict[str, Any]:
-    """Return a trajectory of the page as JSON values: its motions, and its words.
+    """Return a trajectory of the page as JSON values: its motions, figures and texts.
 
-    Drivable carries are driven within their force limits and the limits on jerk,
-    as jobs drive them, with the forces to command. Others are timed as close to the reference
-    speeds as limits allow, with planned forces.
+    A drivable carry is timed as a job drives it, within its force limit and the limits on jerk, and
+    shown with the forces to command. Other carries are timed as close to the reference speeds as
+    the limits allow, and shown with planned forces.
 
     Args:
-        cells: of the page; the last one is the cell that robots drive.
+        cells: cells of the page; the last one is the cell that robots drive.
+        shown: the trajectory.
     """
     cell, driving = cells[shown.cell].cell, cells[-1]
     law = cell.workcell.task.law
@@ -329,11 +355,19 @@ def page_trajectory(cells: Sequence[ReadyCell], shown: PageTrajectory) -> dict[s
 
 
 ROUNDED = 1.001
-"""Factor of a force that still counts as within a limit: timings agree that closely."""
+"""Factor above a force limit that still counts as within it: two timings of one path agree only
+that closely."""
 
 
 def _timed(cell: ho.Cell, driving: ReadyCell, shown: PageTrajectory) -> tuple[Timing | None, str]:
-    """Time a trajectory of a cell as robots drive it, or say why they cannot."""
+    """Time a trajectory as robots drive it. Return the timing and '', or the failed timing or None
+    and the reason why robots cannot drive the trajectory.
+
+    Args:
+        cell: the cell of the trajectory.
+        driving: the cell that robots drive.
+        shown: the trajectory.
+    """
     task = driving.cell.workcell.task
     try:
         if not cell.workcell.task.law.is_drivable:
@@ -365,23 +399,28 @@ def _motion(name: str, carry: ho.Carry, commanded: Array | None = None) -> dict[
 def _uses(
     workcell: Workcell, whole: Array, contact: Sequence[Array]
 ) -> dict[str, list[float | None]]:
-    """Return uses of the joints' torques, of all loads and of the contacts alone; None where the
-    largest allowed is unknown."""
+    """Return the largest use of each joint's torque [%] under two keys, for all loads and for the
+    contact wrenches alone; None for joints without a torque limit.
+
+    Args:
+        whole: (n, joints) torques of all loads [N m].
+        contact: arrays (n, joints) of torques of the contact wrenches [N m].
+    """
     torques = {"torqueUse": whole, "contactTorqueUse": np.concatenate(contact)}
     return {name: _rounded(joint_torque_use(workcell, each), 3) for name, each in torques.items()}
 
 
 def joint_torque_use(workcell: Workcell, torque: Array) -> Array:
-    """Return (joints,) largest use of each joint's torque (n, joints) in percent; NaN where the
-    largest allowed is unknown."""
+    """Return the largest use of each joint's torque limit, (joints,) [%], for torques (n, joints)
+    [N m]; NaN for joints without a limit."""
     limit = workcell.stack_joint_limits("torque_max")
     use = 100.0 * np.abs(torque).max(axis=0) / limit
     return np.where(np.isfinite(limit), use, np.nan)
 
 
 def _values(cell: ho.Cell, judged: ho.Carry, found: dict[str, Any]) -> str:
-    """Return the title of a trajectory: its duration and commanded force; for another carry of a
-    search, its planned forces or objectives."""
+    """Return the values in a trajectory's title: duration and commanded force if there is one; else
+    planned forces, or the objectives."""
     if found["commanded"] is not None:
         order = contact_model(cell.workcell).order
         return f"{found['duration']:.2f} s, {order} {found['commanded']:.1f} N"
@@ -399,8 +438,8 @@ def _values(cell: ho.Cell, judged: ho.Carry, found: dict[str, Any]) -> str:
 
 
 def _samples(carry: ho.Carry, commanded: Array | None) -> Array:
-    """Return some samples (k, 11 + joints) of a carry, see `job_samples`; without commanded forces
-    the planned ones, and nothing that is needed."""
+    """Return samples (k, 11 + joints) of a carry with the columns of `job_samples`. Without
+    commanded forces (n, 2) [N] the planned ones are used, and the needed forces are NaN."""
     force = carry.normal_force if commanded is None else commanded
     peaks = np.concatenate([force.argmax(axis=0), force.argmin(axis=0)])
     time = carry.time - carry.time[0]

@@ -34,16 +34,16 @@ from symbolic.records import Workcell
 Plot = dict[str, Any]
 
 CLOUD_PER_ALGORITHM = 1500
-"""Feasible candidates per algorithm in the background of the fronts."""
+"""Most feasible candidates per algorithm that are drawn behind the fronts."""
 
 LOOK_MARGIN = 0.06
-"""Margin beside the points that a look shows, as a share of their range."""
+"""Margin around the points that a plot first shows, as a share of their range."""
 
 SHOWN_SLOWDOWN = 2.2
-"""Durations in the first look at time and force, over the shortest one."""
+"""The plot of time against force first shows durations up to this multiple of the shortest one."""
 
 HIGHEST = 1.15
-"""Forces there, over the allowed one."""
+"""The plot of time against force first shows forces up to this multiple of the allowed one."""
 
 SYMBOLS = {
     "o": "circle",
@@ -53,25 +53,34 @@ SYMBOLS = {
     "P": "cross",
     "s": "square",
 }
-"""Plotly's names of Matplotlib's markers."""
+"""Plotly's names of the markers by Matplotlib's names."""
 
 CHOICE = {"color": MARKED, "symbol": "star", "size": 17}
 """Marker of the recommended carry."""
 
 
 def plain(text: str) -> str:
-    """Escape a text in which plotly finds no markup."""
+    """Escape a text so that plotly finds no markup in it."""
     return html.escape(text, quote=False)
 
 
 def marker(look: LineStyle, opened: bool = False, size: float = 9) -> Plot:
-    """Return the marker of a series, open if a polished front stands beside a searched one."""
+    """Return plotly's marker in a line style; with `opened` it has no filling, as searched fronts
+    beside polished ones."""
     symbol = SYMBOLS[look.marker]
     return {"color": look.colour, "symbol": f"{symbol}-open" if opened else symbol, "size": size}
 
 
 def points(label: str, at: Array, members: Sequence[int], texts: Sequence[str], look: Plot) -> Plot:
-    """Return points (k, 2) that show their trajectories when clicked."""
+    """Return a plotly trace of points that show their trajectories when clicked.
+
+    Args:
+        label: name in the legend.
+        at: (k, 2) coordinates.
+        members: indices of the trajectories on the page.
+        texts: what is shown when the pointer is over a point.
+        look: plotly's marker.
+    """
     at = np.asarray(at, dtype=float).reshape(-1, 2)
     return _scatter(
         label,
@@ -85,7 +94,8 @@ def points(label: str, at: Array, members: Sequence[int], texts: Sequence[str], 
 
 
 def cloud(label: str, at: Array, look: LineStyle) -> Plot:
-    """Return feasible candidates (n, 2) in the background, thinned out."""
+    """Return a plotly trace of feasible candidates (n, 2) for the background, of which at most
+    `CLOUD_PER_ALGORITHM` are kept."""
     at = at[evenly(len(at), CLOUD_PER_ALGORITHM)]
     flat = [{"dtype": "f4", "bdata": packed(column, np.float32)} for column in at.T]
     style = {"color": look.colour, "symbol": SYMBOLS[look.marker], "size": 3, "opacity": 0.4}
@@ -94,13 +104,13 @@ def cloud(label: str, at: Array, look: LineStyle) -> Plot:
 
 
 def line(label: str, at: Array, colour: str, dash: str) -> Plot:
-    """Return a curve through points (k, 2)."""
+    """Return a plotly trace of a line through points (k, 2)."""
     style = {"color": colour, "dash": dash, "width": 1.6}
     return _scatter(label, at, mode="lines", hoverinfo="skip", line=style)
 
 
 def mark(label: str, at: Array) -> Plot:
-    """Return one point (2,) with its name."""
+    """Return a plotly trace of one named point (2,)."""
     look = {"color": "#1d2327", "size": 11, "symbol": "x-thin", "line": {"width": 2.5}}
     return _scatter(label, at[None], mode="markers", hoverinfo="name", marker=look)
 
@@ -111,13 +121,13 @@ def _scatter(label: str, at: Array, **style: Any) -> Plot:
 
 
 def front_plot(name: str, titles: tuple[str, str], traces: list[Plot], first: Array) -> Plot:
-    """Build a plot of fronts.
+    """Return a plotly plot of fronts.
 
     Args:
-        name: on its button.
-        titles: of the axes.
-        traces: the candidates behind everything first.
-        first: (k, 2) points that the first look shows.
+        name: text on the button that shows the plot.
+        titles: of both axes.
+        traces: the plot's traces, from back to front.
+        first: (k, 2) points that the plot shows at first.
     """
     chosen = {"color": "rgba(0,0,0,0)", "size": 20, "line": {"color": MARKED, "width": 2.5}}
     whole = [np.column_stack([t["x"], t["y"]]) for t in traces if isinstance(t["x"], list)]
@@ -139,13 +149,14 @@ def front_plot(name: str, titles: tuple[str, str], traces: list[Plot], first: Ar
 
 
 def _legend(edge: str, place: float, size: int) -> Plot:
-    """Return a legend in a row along an edge of the plot's element."""
+    """Return a plotly legend in one row along the 'top' or 'bottom' edge of the plot's element."""
     row = {"orientation": "h", "yref": "container", "y": place, "yanchor": edge}
     return {**row, "font": {"size": size}}
 
 
 def limits(points: Array, share: float = LOOK_MARGIN) -> list[list[float]]:
-    """Return limits of both axes around points (k, 2), with a share of their range beside them."""
+    """Return the limits of both axes that contain points (k, 2), with a margin of `share` times
+    their range."""
     points = _finite(points)
     if len(points) == 0:
         return [[0.0, 1.0], [0.0, 1.0]]
@@ -161,13 +172,13 @@ def _finite(points: Array) -> Array:
 
 
 def drive_look(points: Array, always: Array, allowed: float) -> Array:
-    """Return the points (k, 2) of force and duration that the first look shows.
-
-    Both ends of a drivable front are long and flat. Neither is to squash what lies between.
+    """Return those points (k, 2) of force [N] and duration [s] that the plot of time against force
+    shows at first. Left out are the long flat ends of a front, which would squash the part between
+    them.
 
     Args:
-        points: of the fronts and curves.
-        always: (n, 2) further points that the view has to show.
+        points: (n, 2) points of the fronts and curves.
+        always: (m, 2) points that must be shown.
         allowed: the reference force [N].
     """
     points = _finite(points)
@@ -179,9 +190,10 @@ def drive_look(points: Array, always: Array, allowed: float) -> Array:
 
 
 def carry_plots(workcell: Workcell) -> dict[str, Plot]:
-    """Return the plots of one trajectory by the ids of their elements. `meta` says what fills a
-    trace: a column of its samples, a level, or one arm's share of a list of all joints; and what it
-    is called where forces are planned ones."""
+    """Return the plotly plots of one trajectory by the ids of their HTML elements, without data.
+    The entry `meta` of a trace tells the page's script which data to insert: a column of the
+    samples, a constant level, or one arm's joints from a list; and the trace's name where forces
+    are planned ones."""
     joints, arm = [len(robot.torque_max) for robot in workcell.robots], 1 - LEADER
     force, robot = 7 + sum(joints), plain(workcell.robots[arm].name)
     curve = {"type": "scatter", "mode": "lines"}
@@ -238,28 +250,32 @@ def _carry_plot(traces: list[Plot], **layout: Any) -> Plot:
 
 
 MAX_FRONT = 40
-"""Trajectories of one front of the search on the page, spread evenly over it."""
+"""Most trajectories of one front of the search that the page holds, spread evenly over the
+front."""
 
 MAX_DRIVEN = 16
-"""Likewise of a front that robots drive: limits on jerk take a second of work each."""
+"""Most trajectories of one drivable front that the page holds; timing each within limits on jerk
+takes a second."""
 
 CURVE_MEMBERS = 4
-"""Points of the hand-made path's time against force."""
+"""Number of force limits for which the page holds the hand-made path."""
 
 MAX_CELL_BYTES = 2_000_000
-"""A cell whose files are larger is not put into the page, so that nothing can be saved from it."""
+"""Largest total size of a cell's files that the page holds [bytes]. Without the files, trajectories
+cannot be saved from the page."""
 
 
 @dataclass(frozen=True)
 class MeshGroup:
-    """Trajectories that a page shows together.
+    """Trajectories that share a list on the page and a trace in a plot.
 
     Attributes:
-        listed: name of their list.
+        listed: name of the list.
         shown: the trajectories.
-        label, look: of their points in the picture; without a look they are only listed.
-        points: (k, 2) of the picture, None for the commanded force and the duration as robots
-            drive them.
+        label: name of the trace.
+        look: plotly's marker of the trace, None for trajectories that are only listed.
+        points: (k, 2) coordinates in the plot; None for the commanded force and the duration as
+            robots drive the trajectories.
         joined: whether a line joins the points.
     """
 
@@ -272,16 +288,18 @@ class MeshGroup:
 
 
 Numbered = tuple[MeshGroup, list[int]]
-"""A group and the numbers of its trajectories on the page."""
+"""A group of trajectories, and the indices of these on the page."""
 
 
 def page_document(
     data: ReportData, workers: Workers | None = None, paper: bool = True
 ) -> dict[str, Any]:
-    """Return the page's data as JSON values; without workers this process computes them.
+    """Return all data of the page as JSON values.
 
     Args:
-        paper: whether the first experiment's selected carries and fronts are shown, too.
+        data: what the report shows.
+        workers: processes that compute trajectories, None for this process.
+        paper: whether the first experiment's selected carries and fronts are included.
     """
     # Where the cell itself is drivable there is one experiment.
     cells = [] if data.alone else [(data.files, data.objectives)]
@@ -325,7 +343,8 @@ def _trajectory(cells: Cells, shown: PageTrajectory) -> dict[str, Any]:
 
 
 def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator[MeshGroup]:
-    """Yield the recommended carry, the hand-made path at some forces, and the final fronts."""
+    """Yield the groups of trajectories that robots drive: the recommended carry, the hand-made path
+    at some force limits, and the final fronts. `cell` is the index of their cell on the page."""
     if data.recommended is not None:
         found = data.summary.recommendation
         source = "" if found is None else found.source
@@ -353,8 +372,8 @@ def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator
 
 
 def _search_groups(data: ReportData, paper: bool) -> Iterator[MeshGroup]:
-    """Yield the hand-made and the selected trajectories, and the fronts of the first experiment;
-    without the paper's the hand-made one alone."""
+    """Yield the groups of trajectories of the first experiment: the hand-made and the selected
+    ones, and the fronts; if not `paper`, the hand-made one alone."""
     picked = [PageTrajectory(c.source, c.x, job=data.job(c.label)) for c in data.carries]
     if not paper:
         yield MeshGroup("Hand-made", tuple(picked[:1]))
@@ -369,7 +388,8 @@ def _search_groups(data: ReportData, paper: bool) -> Iterator[MeshGroup]:
 
 
 def _traces(groups: Sequence[Numbered], found: Sequence[dict[str, Any]]) -> Iterator[Plot]:
-    """Yield the points of groups that stand in a picture."""
+    """Yield the plotly traces of groups that have a marker; `found` are all trajectories of the
+    page as JSON values."""
     for group, members in groups:
         if group.look is None:
             continue
@@ -396,8 +416,8 @@ def _drive_view(
     groups: Sequence[Numbered],
     found: Sequence[dict[str, Any]],
 ) -> Plot:
-    """Return time against commanded force of the hand-made path and the fronts, as jobs drive
-    them, with the recommended carry and the allowed force."""
+    """Return the plot of duration against commanded force, as jobs drive the carries: the hand-made
+    path, the fronts, the recommended carry and the allowed force."""
     allowed = float(drivable.workcell.task.reference_force[1 - LEADER])
     # The recommended carry is drawn last, above all others.
     shown = sorted(_traces(groups, found), key=lambda trace: trace["name"] == RECOMMENDED_TITLE)
@@ -417,7 +437,8 @@ def _drive_view(
 
 
 def _allowed(force: float) -> Plot:
-    """Return a line up the picture at the reference force, with its name."""
+    """Return a vertical line with text at the reference force [N], as entries of a plotly
+    layout."""
     look = {"color": "#8a6d00", "dash": "dash", "width": 1.6}
     line = {"type": "line", "x0": force, "x1": force, "yref": "paper", "y0": 0, "y1": 1}
     text = {"x": force, "yref": "paper", "y": 1, "text": f"allowed {force:.1f} N"}
@@ -428,7 +449,7 @@ def _allowed(force: float) -> Plot:
 def _search_view(
     data: ReportData, groups: Sequence[Numbered], found: Sequence[dict[str, Any]]
 ) -> Plot:
-    """Build the plot of the first experiment's fronts."""
+    """Return the plot of the first experiment's fronts."""
     titles = [*data.objective_titles, "", ""]
     judged = [carry.timed.judgement for carry in data.carries]
     selected = np.array([list(one.objectives.values()) for one in judged if one is not None])

@@ -30,13 +30,19 @@ from studies.report.page_carries import joint_torque_use
 from symbolic.array import Array
 
 PREDICTED: dict[str, Any] = {"color": "black", "linestyle": (0, (2, 1.5)), "linewidth": 0.8}
-"""Style of the predicted quantities of a simulation."""
+"""Matplotlib's keyword arguments for predicted curves in the picture of a simulation."""
 
 
 def _per_robot(
     data: ReportData, titles: tuple[str, str], draw: Callable[[Axes, int], None], columns: int = 0
 ) -> Figure:
-    """Create a panel per robot with common axes and titles, and one legend."""
+    """Return a figure with one panel per robot, common axes and one legend.
+
+    Args:
+        titles: of both axes.
+        draw: draws into the panel of a robot, of index 0 or 1.
+        columns: of the legend, 0 for one row.
+    """
     figure = new_figure(0.48)
     panels = figure.subplots(1, 2, sharey=True)
     for i, (axes, robot) in enumerate(zip(panels, data.workcell.robots, strict=True)):
@@ -175,8 +181,13 @@ def joint_torques(data: ReportData) -> Figure:
 
 
 def _label_rings(axes: Axes, most: Array, top: float) -> None:
-    """Round values up to `top` [%] on the rings, written between the two neighbouring joints that
-    leave most room: most (n,) is the largest use of each [%]."""
+    """Set rings of a polar plot at round values up to `top` [%]. Their labels stand in the gap
+    between two neighbouring joints that leave most room.
+
+    Args:
+        most: (n,) largest use of each joint's torque [%].
+        top: radius of the plot [%].
+    """
     rings = MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(0.0, 1.02 * top)
     axes.set_ylim(0.0, rings[-1])
     axes.set_yticks(rings[1:-1], [f"{ring:g} %" for ring in rings[1:-1]], va="center", ha="center")

@@ -51,31 +51,31 @@ _PLAN = View(np.array([0.0, -1.0, 0.0]), np.array([1.0, 0.0, 0.0]), "y [m]", "x 
 """View from above, the front below."""
 
 HATCHES = ("////", "\\\\\\\\")
-"""Hatches of the regions that the pads reach."""
+"""Hatches of the two regions that the pads reach."""
 
 SHARES = (0.0, 0.33, 0.66, 1.0)
-"""Shares of a carry's duration, as in the paper's Figures 14 and 15."""
+"""Shares of a carry's duration at which it is drawn, as in the paper's Figures 14 and 15."""
 
 
 CUBE_EDGE = 0.05
-"""Edge of the cubes [m]: what a drawing of two metres shows."""
+"""Edge of the grid's cubes [m]; finer ones could not be seen in a picture of two metres."""
 
 REACH_POSTURES = 300_000
-"""Random postures per arm; some ten per cube of the reach of an arm of 1.3 m."""
+"""Number of random postures per arm; about ten per cube for an arm with a reach of 1.3 m."""
 
 
 @dataclass(frozen=True)
 class ReachMap:
-    """Where the arms' pads and the box can be, on a grid of cubes, positions only.
+    """Positions that the pads and the box can take, on a grid of cubes; orientations are ignored.
 
-    A cube is reached if a sampled posture within the joint limits puts the pad there.
+    A cube counts as reached if a random posture within the joint limits puts the pad into it.
 
     Attributes:
-        lower: (3,) corner of the grid in the world [m].
+        lower: (3,) lower corner of the grid in the world frame [m].
         step: edge of the cubes [m].
-        pads: per arm a boolean (nx, ny, nz).
-        common: boolean (nx, ny, nz), box centres from which a level box has both its pads in
-            cubes that their arms reach.
+        pads: per arm a boolean array (nx, ny, nz), True for reached cubes.
+        common: boolean array (nx, ny, nz), True for positions of the box centre from which a level
+            box has both pads in cubes that their arms reach.
     """
 
     lower: Array
@@ -85,10 +85,8 @@ class ReachMap:
 
 
 def reach_map(geometry: CellGeometry, rng: np.random.Generator) -> ReachMap:
-    """Sample both arms' pads over their joint limits.
-
-    Sampling leaves single cubes out; holes of a few cubes are closed.
-    """
+    """Return the cubes that both pads reach in random postures within the joint limits. Holes of a
+    few cubes, which random postures miss, are filled."""
     clouds = [_pad_points(geometry, i, rng) for i in (0, 1)]
     both = np.concatenate(clouds)
     lower = np.floor(both.min(axis=0) / CUBE_EDGE - 3.0) * CUBE_EDGE
@@ -109,8 +107,8 @@ def reach_map(geometry: CellGeometry, rng: np.random.Generator) -> ReachMap:
 
 
 def _pad_points(geometry: CellGeometry, i: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Compute pad positions (POSTURES, 3) in the world of random postures within the joint
-    limits."""
+    """Return pad positions (REACH_POSTURES, 3) of arm i in the world frame [m], in random postures
+    within the joint limits."""
     arm, contact = geometry.arms[i], geometry.workcell.contacts[i]
     pad = (arm.T_joint_box @ contact.T_box_pad)[:3, 3]
     # Single precision is far more than cubes need, and half the work.
@@ -133,7 +131,7 @@ def _pad_points(geometry: CellGeometry, i: int, rng: np.random.Generator) -> NDA
 
 
 def _seen(T: Array, points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Transform points (3, n) by T (4, 4)."""
+    """Transform points (3, n) by the homogeneous transform T (4, 4)."""
     placed = T.astype(np.float32)
     return np.asarray(placed[:3, :3] @ points + placed[:3, 3:])
 
@@ -204,7 +202,17 @@ def _draw_views(
     hidden: tuple[str, ...] = (),
     margin: float = MARGIN,
 ) -> None:
-    """Draw the cell at one sample in panels: title, view, and points to fit, of each."""
+    """Draw the cell at one sample in several panels.
+
+    Args:
+        panels: the panels.
+        cell: the solids to draw.
+        shown: per panel its title, its view, and points (n, 3) of the world that it must contain.
+        pose: (6,) pose of the box [m, rad].
+        q: (12,) joint positions of both arms [rad].
+        hidden: kinds of frames whose solids are left out.
+        margin: around the points [m].
+    """
     for axes, letter, (text, view, points) in zip(panels, "abc", shown, strict=True):
         draw_cell(axes, cell, view, pose, q, hidden)
         panel_label(axes, letter, text, bare=True)
@@ -212,8 +220,8 @@ def _draw_views(
 
 
 def facing(way: Array) -> View:
-    """Return the oblique view in which a motion along (3,) approaches the viewer: the machine does
-    not hide its arm."""
+    """Return an oblique view in which a motion along the direction (3,) comes towards the viewer,
+    so that the machine does not hide its arm."""
     return max(ISOMETRIC, OTHER_SIDE, key=lambda view: float(way @ view.towards))
 
 
@@ -287,8 +295,8 @@ def paths(geometry: CellGeometry, carries: tuple[DrawnCarry, ...]) -> Figure:
 
 
 def planes(points: Array) -> tuple[tuple[View, str], tuple[View, str]]:
-    """Return the two coordinate planes, with their names, in which points (n, 3) extend
-    farthest."""
+    """Return the two coordinate planes in which points (n, 3) extend farthest, each as a view and
+    its name."""
     extent = np.ptp(points, axis=0)
     every = (("y–z plane", FRONT_VIEW, 0), ("x–z plane", SIDE, 1), ("x–y plane", _PLAN, 2))
     first, second, _ = sorted(every, key=lambda plane: float(extent[plane[2]]))
@@ -322,8 +330,9 @@ def _reach_bounds(reach: ReachMap) -> Array:
 
 
 def _draw_reach(axes: Axes, reach: ReachMap, view: View, across: int, at: float) -> None:
-    """Draw slices of the reach across a world axis; along the line between the arms only the common
-    reach, because the own regions would hide it."""
+    """Draw slices of the reached regions across a world axis, at coordinate `at` [m]. Across the
+    line between the arms, only the common region is drawn, because the pads' regions would hide
+    it."""
     index = int((at - reach.lower[across]) / reach.step)
     if across == 0:
         for pads, colour, hatch in zip(reach.pads, ARM_COLOURS, HATCHES, strict=True):
@@ -342,7 +351,8 @@ def _draw_slice(
     hatch: str,
     alpha: float = 0.35,
 ) -> None:
-    """Fill a slice of a region (nx, ny, nz) of the grid across a world axis."""
+    """Fill one slice of a region (nx, ny, nz) of the grid. `across` is the world axis that is
+    perpendicular to the slice, `index` the slice's position in cubes."""
     mask = np.take(region, index, axis=across)
     if not mask.any():
         return
@@ -366,20 +376,23 @@ def _draw_slice(
 
 
 OTHER_SIDE = oblique(np.deg2rad(28.0), np.deg2rad(26.0))
-"""As `ISOMETRIC`, from behind."""
+"""View like `ISOMETRIC`, from the opposite side."""
 
 CLOSE_UP = 0.25
-"""Half the width of what is shown near by [m]."""
+"""Half the width of a close-up [m]."""
 
 
 def meeting(
     geometry: CellGeometry, pair: tuple[str, str], pose: Array, q: Array, title: str
 ) -> Figure:
-    """Draw two colliding bodies in red: the whole cell, and their surroundings from two sides.
+    """Draw two colliding bodies in red: once in the whole cell, and twice with their surroundings,
+    from two sides.
 
     Args:
         pair: names of the bodies.
-        pose, q: (6,) of the box and (all joints,) at the collision [m, rad].
+        pose: (6,) pose of the box at the collision [m, rad].
+        q: (joints,) joint positions of both arms at the collision [rad].
+        title: of the figure.
     """
     figure = new_figure(0.36)
     solids = cell_solids(geometry)
@@ -403,8 +416,14 @@ def meeting_place(
     pose: Array,
     q: Array,
 ) -> Array:
-    """Compute the middle (3,) of the intersection of both bodies' bounding boxes in the world
-    [m]."""
+    """Return the middle (3,) of the intersection of two bodies' bounding boxes in the world frame
+    [m].
+
+    Args:
+        pair: names of the bodies.
+        pose: (6,) pose of the box [m, rad].
+        q: (joints,) joint positions of both arms [rad].
+    """
     placed = frame_placements(geometry, pose[None], q[None])
     low, high = np.full(3, -np.inf), np.full(3, np.inf)
     for name in pair:

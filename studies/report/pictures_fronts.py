@@ -33,7 +33,7 @@ from studies.study.tables import constraint_title
 from symbolic.array import Array
 
 QUARTILES = (25.0, 75.0)
-"""Attainment surfaces beside the median, in percent of the replicas."""
+"""Percentiles of the attainment surfaces that are drawn beside the median [% of the replicas]."""
 
 
 def fronts(data: ReportData) -> Figure:
@@ -97,7 +97,8 @@ def attainment(data: ReportData) -> Figure:
 
 
 def _attained(title: str, percentile: float) -> str:
-    """Return the legend of a surface; both quartiles look alike and share one entry."""
+    """Return the legend entry of an attainment surface. Both quartiles look alike, so only one of
+    them gets an entry."""
     if percentile not in QUARTILES:
         return f"{title}: median"
     shares = " and ".join(f"{share:.0f} %" for share in QUARTILES)
@@ -124,7 +125,7 @@ def polish(data: ReportData) -> Figure:
 
 
 def _paired(axes: Axes, algorithms: Sequence[AlgorithmRuns]) -> None:
-    """Draw the hypervolumes of all replicas before and after."""
+    """Draw the hypervolume of every replica before and after the polish."""
     names = []
     for k, algorithm in enumerate(algorithms):
         look = algorithm.look
@@ -144,8 +145,8 @@ def _paired(axes: Axes, algorithms: Sequence[AlgorithmRuns]) -> None:
 
 
 def _objectives(axes: Axes, data: ReportData) -> None:
-    """Draw the axes of the first two objectives, with the level payload at rest, and the
-    recommended carry on its front."""
+    """Set the axes to the first two objectives; draw the level payload at rest and the star of the
+    recommended carry."""
     if data.at_rest is not None:
         look: dict[str, Any] = {
             "color": "black",
@@ -169,8 +170,8 @@ def _recommended(axes: Axes, data: ReportData) -> None:
 
 
 def _zoom(axes: Axes, data: ReportData, sets: Sequence[Array]) -> None:
-    """Return limits around fronts, their corner at rest and the carry recommended from them
-    included."""
+    """Set the limits of the axes to contain the fronts, the level payload at rest and the
+    recommended carry."""
     points = [np.atleast_2d(points)[:, :2] for points in sets if len(points)]
     if data.at_rest is not None:
         points.append(data.at_rest[None])
@@ -203,7 +204,7 @@ def duration_against_force(data: ReportData, choice: StoredRecommendation) -> Fi
 
 
 LATE = 0.5
-"""The inset of the histories shows evaluations from this share of the budget on."""
+"""The inset of the histories starts at this share of the evaluations."""
 
 
 def histories(data: ReportData) -> Figure:

@@ -308,8 +308,8 @@ def infeasible(summary: CampaignSummary) -> Table:
 
 
 def constraint_title(name: str, robots: Sequence[str]) -> str:
-    """Return a constraint's name for people: 'joint_limits_1' becomes 'joint limits', followed by
-    the name of robot 1."""
+    """Return a constraint's name for people: 'reach_1' becomes 'reach' with the name of the first
+    robot."""
     words = name.split("_")
     if words[-1].isdigit():
         return f"{' '.join(words[:-1])}, {robots[int(words[-1]) - 1]}"
