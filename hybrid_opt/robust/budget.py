@@ -154,15 +154,26 @@ def grip_budget(workcell: Workcell) -> GripBudget:
         SettingsError: some cases cannot be held by any force, or the uncertainty leaves no friction
             or patch.
     """
-    model, allowed = interpreted_robust_model(workcell), workcell.task.reference_force
-    waypoints = workcell.task.waypoints
-    poses = np.array([waypoints[0].lower, waypoints[-1].lower])
-    motion = BoxMotion(poses, np.zeros_like(poses), np.zeros_like(poses))
-    required = largest_forces(model, motion)
+    model, motion = interpreted_robust_model(workcell), _ends_at_rest(workcell)
+    required, allowed = largest_forces(model, motion), workcell.task.reference_force
     budget = GripBudget(required, allowed, workcell.uncertainty, ())
     if budget.fits:
         return budget
     return replace(budget, remedies=cheapest_remedies(model, motion, required, allowed))
+
+
+def required_at_rest(workcell: Workcell) -> Array:
+    """Compute the forces (2,) of `GripBudget.required`, without remedies [N]; errors as those of
+    `grip_budget`."""
+    return largest_forces(interpreted_robust_model(workcell), _ends_at_rest(workcell))
+
+
+def _ends_at_rest(workcell: Workcell) -> BoxMotion:
+    """Build the motion of a payload at rest at both ends of its path."""
+    poses = np.array(
+        [way.lower for way in (workcell.task.waypoints[0], workcell.task.waypoints[-1])]
+    )
+    return BoxMotion(poses, np.zeros_like(poses), np.zeros_like(poses))
 
 
 def largest_forces(

@@ -1,6 +1,6 @@
 """First carries for the problems that ship, and what comes of them.
 
-Twelve problems of two UR5, UR10, Panda or xArm7: flat, over a wall, past a post, into and off a
+Thirteen problems of two UR5, UR10, Panda or xArm7: flat, over a wall, past a post, into and off a
 shelf, out of a bin, turned, pitched, turned over. Each is proposed from nothing with every seed;
 with --recommend a drivable search, a polish and a recommendation follow, which compile.
 """

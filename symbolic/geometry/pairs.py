@@ -7,7 +7,7 @@ they touch in every sampled posture, or a bound of their motion proves that they
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property, lru_cache
 from itertools import combinations, product
@@ -275,21 +275,29 @@ def _is_far(a: CollisionBody, b: CollisionBody) -> bool:
     return still and a.group != b.group and "payload" not in (a.group, b.group)
 
 
-def _check_tools(bodies: tuple[CollisionBody, ...], arms: tuple[ArmGeometry, ArmGeometry]) -> None:
-    """Check that tools do not penetrate the payload that they hold beyond touching."""
+def tools_in_payload(
+    bodies: Sequence[CollisionBody], T_joint_box: Sequence[Array]
+) -> Iterator[CollisionBody]:
+    """Yield the tool parts that penetrate the payload beyond touching, with the payload at (4, 4)
+    in the frame of each arm's last joint."""
     payload = next(body for body in bodies if body.frame.kind == "box")
     cores = [shrunk(piece, MOST_ENTERED) for piece in payload.pieces]
     for body in bodies:
-        if not body.is_tool:
-            continue
-        held = tuple(core.moved(arms[body.frame.robot].T_joint_box) for core in cores)
-        if coal_distance(held, body.pieces) <= 0.0:
-            raise CollisionModelError(
-                f"the tool part {body.name!r} enters the payload by more than "
-                f"{1e3 * MOST_ENTERED:g} mm where the robot holds it; move or shorten the part, or "
-                "move the pad's frame to its tip (robots.pad)",
-                code="tool-in-payload",
-            )
+        if body.is_tool:
+            held = tuple(core.moved(T_joint_box[body.frame.robot]) for core in cores)
+            if coal_distance(held, body.pieces) <= 0.0:
+                yield body
+
+
+def _check_tools(bodies: tuple[CollisionBody, ...], arms: tuple[ArmGeometry, ArmGeometry]) -> None:
+    """Check that tools do not penetrate the payload that they hold beyond touching."""
+    for body in tools_in_payload(bodies, [arm.T_joint_box for arm in arms]):
+        raise CollisionModelError(
+            f"the tool part {body.name!r} enters the payload by more than "
+            f"{1e3 * MOST_ENTERED:g} mm where the robot holds it; move or shorten the part, or "
+            "move the pad's frame to its tip (robots.pad)",
+            code="tool-in-payload",
+        )
 
 
 def _rigid(a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> str:

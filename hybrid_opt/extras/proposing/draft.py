@@ -15,6 +15,8 @@ from hybrid_opt.extras.proposing.decimals import (
     readable_turns,
     rounded_outwards,
 )
+from hybrid_opt.extras.proposing.hand_places import place_entry
+from hybrid_opt.extras.proposing.kinematics import rotate_about_normal
 from hybrid_opt.extras.proposing.problem import DRAFT_ROOM, Problem
 from symbolic.array import Array
 from symbolic.read.editing import merged
@@ -92,13 +94,16 @@ def changes(problem: Problem, found: Draft) -> dict[str, Any]:
         if robot.redundant_joints:
             entry["redundant_joints"] = list(robot.redundant_joints)
         robots.append(entry)
-        spin = float(problem.data["contacts"][i].get("spin", 0.0)) + found.spins[i]
-        contacts.append(
-            {
-                **found.given.get("contacts", problem.contacts)[i],
-                "spin": round(float(np.remainder(spin + np.pi, 2 * np.pi) - np.pi), 9),
-            }
-        )
+        entry = found.given.get("contacts", problem.contacts)[i]
+        contact = found.workcell.contacts[i]
+        if contact.further and found.spins[i]:
+            with_normals = "normal" in problem.data["contacts"][i]
+            entry = place_entry(rotate_about_normal(contact, found.spins[i]), with_normals)
+        else:
+            spin = entry.get("spin", problem.data["contacts"][i].get("spin", 0.0)) + found.spins[i]
+            turn = float(np.remainder(spin + np.pi, 2 * np.pi) - np.pi)
+            entry = {**entry, "spin": round(turn, 9)}
+        contacts.append(entry)
     chosen: dict[str, Any] = {"robots": robots, "contacts": contacts, "task": task}
     if found.stand_off is not None:
         chosen["handling"] = {"stand_off": found.stand_off}

@@ -17,15 +17,17 @@ from hybrid_opt.extras.proposing.kinematics import (
     MANIPULABILITY_MARGIN,
     REACHED,
     ArmKinematics,
+    covers_the_same,
     has_wrist_spin,
+    rotate_about_normal,
 )
 from hybrid_opt.extras.proposing.trial import PoseJudge
 from symbolic.array import Array
 from symbolic.geometry.bodies import WORLD, Frame
-from symbolic.geometry.pairs import coal_distance
+from symbolic.geometry.pairs import coal_distance, tools_in_payload
 from symbolic.read.arms import arm_model
 from symbolic.records import Contact
-from symbolic.records.poses import box_placement
+from symbolic.records.poses import box_placement, inverse
 
 GUIDE_POSES = 25
 """Number of poses of a guide, a path along which postures are followed."""
@@ -33,18 +35,15 @@ GUIDE_POSES = 25
 
 def possible_spins(contact: Contact, spins: Array) -> Array:
     """Return those of spins (n,) [rad] that leave a robot's patches unchanged: all of one round
-    pad, half turns of a rectangular one, only 0 if further pads stand beside the first."""
-    if contact.further:
-        return np.zeros(1)
-    if contact.half_sides is None:
-        return spins
-    return np.asarray(spins[np.abs(np.sin(spins)) < 1e-9])
+    pad, half turns of a rectangular one, quarter turns of a square array of cups."""
+    same = [covers_the_same(contact, rotate_about_normal(contact, float(spin))) for spin in spins]
+    return np.asarray(spins[same])
 
 
 def clear_spins(query: HoldQuery, kinematics: ArmKinematics, spins: Array) -> Array:
     """Return those of spins (n,) [rad] at which the bodies fixed to the arm's last joint, hand,
-    tool and pad, meet nothing that stands, at the start and at the goal; all of them if none is
-    free.
+    tool and pad, do not enter the payload and meet nothing that stands, at the start and at the
+    goal; all of them if none is free.
 
     Within a shelf that is a few of twelve, on which all random starts are spent then.
     """
@@ -65,6 +64,10 @@ def clear_spins(query: HoldQuery, kinematics: ArmKinematics, spins: Array) -> Ar
 
     def clear(spin: float) -> bool:
         T_box_joint = kinematics.held(spin)
+        T_joint_box = [inverse(T_box_joint)] * 2
+        entering = tools_in_payload(geometry.bodies, T_joint_box)
+        if any(body.frame.robot == kinematics.arm for body in entering):
+            return False
         return all(
             coal_distance(
                 tuple(piece.moved(end @ T_box_joint) for piece in hand.pieces), standing.pieces

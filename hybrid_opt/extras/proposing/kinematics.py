@@ -13,7 +13,7 @@ from symbolic.array import Array
 from symbolic.geometry.bodies import ArmGeometry, arm_geometry
 from symbolic.read.arms import arm_model, common_joints
 from symbolic.records import Contact, Robot, Workcell
-from symbolic.records.poses import inverse, pose_matrix
+from symbolic.records.poses import inverse, pose_matrix, transform
 
 REACHED = 1e-6
 """A posture counts as reached if its pose residual is smaller [m, rad]."""
@@ -32,6 +32,9 @@ MANIPULABILITY_MARGIN = 1.1
 
 JUMP = 0.5
 """Largest change of a joint between poses of a path [rad]."""
+
+SAME_PATCH = 1e-6
+"""Difference below which patches cover one another [m, and of unit vectors]."""
 
 
 @dataclass(frozen=True)
@@ -240,9 +243,32 @@ class ArmKinematics:
 
 
 def rotate_about_normal(contact: Contact, spin: float) -> Contact:
-    """Return a contact with its pad turned about its normal by an angle [rad]."""
+    """Return a contact with its pad turned about its normal by an angle [rad]; further pads turn
+    with it, all about their middle."""
     turn = pose_matrix(np.zeros(3), np.array([0.0, 0.0, spin]))
-    return replace(contact, T_box_pad=contact.T_box_pad @ turn)
+    if not contact.further:
+        return replace(contact, T_box_pad=contact.T_box_pad @ turn)
+    points = [pad.T_box_pad[:3, 3] for pad in (contact, *contact.further)]
+    middle = transform(contact.T_box_pad[:3, :3], np.mean(points, axis=0))
+    return moved(contact, middle @ turn @ inverse(middle))
+
+
+def moved(contact: Contact, motion: Array) -> Contact:
+    """Return a contact with all its pads moved by a transform (4, 4), in the box frame."""
+    further = tuple(replace(pad, T_box_pad=motion @ pad.T_box_pad) for pad in contact.further)
+    return replace(contact, T_box_pad=motion @ contact.T_box_pad, further=further)
+
+
+def covers_the_same(contact: Contact, other: Contact) -> bool:
+    """Return True if pads of the same kind cover the same patches, in any order."""
+
+    def alike(a: Contact, b: Contact) -> bool:
+        apart = np.abs(a.T_box_pad[:3, 2:] - b.T_box_pad[:3, 2:]).max()
+        turned = abs(float(a.T_box_pad[:3, 0] @ b.T_box_pad[:3, 0]))
+        return bool(apart < SAME_PATCH and (a.half_sides is None or turned > 1.0 - SAME_PATCH))
+
+    pads = (other, *other.further)
+    return all(any(alike(pad, one) for one in pads) for pad in (contact, *contact.further))
 
 
 def shoulder_positions(robots: tuple[Robot, Robot]) -> Array:

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.extras.proposing.decimals import pose_limits, readable_turns
+from hybrid_opt.extras.proposing.hand_places import hand_places, pattern_entry
 from hybrid_opt.extras.proposing.kinematics import shoulder_positions
 from symbolic import safe_io
 from symbolic.array import Array
@@ -19,6 +20,7 @@ from symbolic.errors import OutsideError, WorkcellError
 from symbolic.read.cell import load
 from symbolic.read.descriptions import PACKAGE_SCHEME
 from symbolic.read.editing import completed, merged, with_paths
+from symbolic.read.payload import read_contact, read_payload
 from symbolic.read.robots import read_robot
 from symbolic.read.tables import TableReader
 from symbolic.records import Robot, Workcell
@@ -85,14 +87,18 @@ class Problem:
     def contacts(self) -> list[dict[str, Any]]:
         """Both contacts' points, the middles of opposite faces where the file has none: those that
         face the robots (the shoulders of a machine with both arms), or those that the carry passes
-        sideways where the robots have no bases.
+        sideways where the robots have no bases. Of hands that hold by themselves the best of
+        `hand_places`.
 
         Raises:
-            WorkcellError: shoulders are needed, and the robots are wrong.
+            WorkcellError: shoulders are needed, and the robots are wrong; or hands have no room on
+                any face.
         """
         entries = self.data["contacts"]
         if all("xyz" in entry for entry in entries):
             return [{"xyz": entry["xyz"]} for entry in entries]
+        if self.has_hands:
+            return self._hand_places[0]
         bases = self._bases
         start, goal = self.poses
         size = np.array(self.data["payload"]["size"], dtype=float)
@@ -111,12 +117,46 @@ class Problem:
             shoulder_positions(self._robots()) if self.is_machine else np.array(found, dtype=float)
         )
 
+    @property
+    def has_hands(self) -> bool:
+        """True if both contacts are hands that hold by themselves."""
+        return all(entry.get("kind", "pad") != "pad" for entry in self.data["contacts"])
+
+    @cached_property
+    def _hand_places(self) -> list[list[dict[str, Any]]]:
+        """Places of both arms' hands, the best first."""
+        size = np.array(self.data["payload"]["size"], dtype=float)
+        thickness, problems = float(size.min()), Problems()
+        entries = [pattern_entry(entry, thickness) for entry in self.data["contacts"]]
+        table = TableReader({**self.data, "contacts": entries}, "", problems)
+        payload = read_payload(table.table("payload"), self.source.parent)
+        patterns = [read_contact(entry, payload) for entry in table.tables("contacts")]
+        if problems.found:
+            raise WorkcellError(str(self.source), problems.messages())
+        R = box_placement(self.orientation, np.array(self.poses))[:, :3, :3]
+        bases = np.zeros((2, 3)) if self._bases is None else self._bases
+        found = hand_places(
+            patterns,
+            size,
+            R,
+            (bases[0] - bases[1]) @ R[0],
+            lambda contacts: self.workcell({"contacts": contacts}),
+        )
+        if not found:
+            told = (
+                "contacts: no free face of the box has room for hands whose tools stay outside it"
+            )
+            raise WorkcellError(str(self.source), (told,))
+        return found
+
     def other_contacts(self) -> list[list[dict[str, Any]]]:
         """Return the other pairs of faces that the pads may press, both ways round, the most
         promising first: upright faces, then those that face the robots. None if the file names
         points or has no bases."""
         if self._bases is None or all("xyz" in entry for entry in self.data["contacts"]):
             return []
+        if self.has_hands:
+            return self._hand_places[1:]
         R = box_placement(self.orientation, self.poses[0])[:3, :3]
         size = np.array(self.data["payload"]["size"], dtype=float)
         along = self._bases[0] - self._bases[1]
@@ -169,7 +209,9 @@ class Problem:
         Raises:
             WorkcellError: the file is wrong; the message lists all problems.
         """
-        changes = merged({"contacts": self.contacts}, changes or {})
+        changes = changes or {}
+        if "contacts" not in changes:
+            changes = merged({"contacts": self.contacts}, changes)
         task = dict(self.data["task"])
         if "waypoints" not in changes.get("task", {}):
             (middle,) = readable_turns(np.mean(self.poses, axis=0)[None], self.orientation)
@@ -250,6 +292,9 @@ def _require_known(table: TableReader) -> None:
         )
     if all("xyz" in entry for entry in contacts):
         return
+    for entry in contacts:
+        for other in entry.tables("further"):
+            other.vector("xyz", (quantity.POSITION,) * 3)
     if payload.raw("kind", "box") != "box":
         table.add("contacts", "xyz is needed for a payload that is no box")
     else:

@@ -34,7 +34,6 @@ from hybrid_opt.robust.budget import budget_text
 from hybrid_opt.static_hold import require_hold
 from symbolic.array import Array
 from symbolic.cell_model import CellBodies, build_cell_bodies
-from symbolic.contact.registry import require_squeeze
 from symbolic.read.arms import FOLLOWING, arm_model, common_joints, turning_joints
 from symbolic.read.editing import merged
 from symbolic.records import POSE_SIZE, Task, Workcell
@@ -187,12 +186,10 @@ def prepare(
     Raises:
         ProposalError: an arm cannot hold the box at start and goal; the text says why.
         WorkcellError: the problem is wrong, or no arms could hold the payload still.
-        SettingsError: the hands hold by themselves.
     """
     start, goal = problem.poses
     given = merged(given, redundancy(problem, problem.workcell(given)))
     workcell = problem.workcell(given)
-    require_squeeze(workcell, "a proposal")
     require_hold(workcell)
     tell(budget_text(workcell))
     lacking = reach_missing(workcell, (start, goal), spins)

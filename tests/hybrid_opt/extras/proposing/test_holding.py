@@ -38,7 +38,7 @@ from symbolic.geometry.pairs import coal_distance
 from symbolic.read.arms import arm_model
 from symbolic.read.cell import load
 from symbolic.read.editing import completed, merged
-from symbolic.records import Body, Box, Workcell
+from symbolic.records import Body, Box, Contact, Workcell
 from symbolic.records.poses import box_placement, pose_matrix
 from symbolic.robot.branches import inverse_kinematics
 from tests.hybrid_opt.extras.proposing.problems import tiago_problem
@@ -128,13 +128,28 @@ def test_spins_are_left_out_at_which_the_pad_meets_what_stands(rack_cell: Workce
     np.testing.assert_array_equal(clear_spins(replace(query, judge=None), arm, spins), spins)
 
 
-def test_pads_that_stand_rigidly_beside_one_another_are_not_spun() -> None:
+def test_spins_leave_the_patches_of_an_arm_where_they_are() -> None:
+    """Two tines and two fingers make half turns, an array of cups longer than wide as well, a
+    square one quarter turns."""
     fork, round_pad = load("studies/workcells/fork.toml").contacts, load(RACK).contacts[0]
     np.testing.assert_array_equal(possible_spins(round_pad, SPINS), SPINS)
-    assert fork[0].further
-    assert possible_spins(fork[0], SPINS).tolist() == [0.0]
     # A rectangle covers the same patch after half a turn only.
     np.testing.assert_allclose(possible_spins(fork[1], SPINS), [0.0, np.pi])
+    assert fork[0].further
+    np.testing.assert_allclose(possible_spins(fork[0], SPINS), [0.0, np.pi])
+    fingers = load("studies/workcells/plate.toml").contacts[0]
+    np.testing.assert_allclose(possible_spins(fingers, SPINS), [0.0, np.pi])
+    cups = load("studies/workcells/palletising.toml").contacts[0]
+    np.testing.assert_allclose(possible_spins(cups, SPINS), [0.0, np.pi])
+    others = ((0.0, 0.12), (0.12, 0.0), (0.12, 0.12))
+    square = replace(cups, further=tuple(_at(cups, x, y) for x, y in others))
+    np.testing.assert_allclose(possible_spins(square, SPINS), np.pi / 2.0 * np.arange(4))
+
+
+def _at(contact: Contact, x: float, y: float) -> Contact:
+    """Return a hand beside another, along its axes [m]."""
+    beside = pose_matrix(np.array([x, y, 0.0]), np.zeros(3))
+    return replace(contact, T_box_pad=contact.T_box_pad @ beside, further=())
 
 
 def test_holds_hold_the_box_at_both_ends(rack_cell: Workcell) -> None:

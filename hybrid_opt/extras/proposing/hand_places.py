@@ -1,0 +1,188 @@
+"""Places on a box for hands that hold by themselves: faces, heights and turns, ranked by the
+holding force that the payload at rest requires in every case of the uncertainty.
+
+All hands of an arm move as one pattern, such as an array of cups or the fingers of a gripper.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from hybrid_opt.extras.proposing.kinematics import covers_the_same, moved, rotate_about_normal
+from hybrid_opt.robust.budget import required_at_rest
+from symbolic.array import Array
+from symbolic.geometry.bodies import arm_geometry, collision_bodies
+from symbolic.geometry.pairs import tools_in_payload
+from symbolic.read.payload import pad_rotation
+from symbolic.records import Contact, Workcell
+from symbolic.records.poses import inverse, pose_matrix, transform
+
+HEIGHTS = ((0.0, 0.0), (0.5, 0.0), (-0.5, 0.0), (1.0, 0.0), (-1.0, 0.0))
+"""Places on opposite faces, the same for both arms, along the face's axes over the room that a
+pattern leaves there; the first axis points upwards on upright faces."""
+
+BESIDE = tuple(k * np.array(way) for way in ((1, 0), (-1, 0), (0, 1), (0, -1)) for k in (1.0, 0.5))
+"""Places of the first arm's hands on one face, at its edges and halfway; the other arm's are
+opposite."""
+
+EDGE = 0.005
+"""Distance of patches from the edges of their face [m]."""
+
+DOWNWARDS = -0.7
+"""Upward share of a face's outward normal below which no hand gets there."""
+
+MOST_PLACES = 16
+"""Places of both arms' hands that are kept."""
+
+Both = tuple[Contact, Contact]
+
+Entry = dict[str, Any]
+"""The keys `xyz`, `spin`, `normal` and `further` of `[[contacts]]`."""
+
+
+def pattern_entry(entry: Entry, thickness: float) -> Entry:
+    """Return a contact's entry with its hands in the axes of the first one, z into the payload.
+
+    Args:
+        entry: without `xyz`; the `xyz` of its `further` hands are in these axes.
+        thickness: of the payload, for the opposite finger of a gripper without `further` [m].
+    """
+    further = entry.get("further", [])
+    if entry.get("kind") == "fingers" and not further:
+        further = [{"xyz": [0.0, 0.0, thickness]}]
+    normals = [[0.0, 0.0, -1.0 if other["xyz"][2] > EDGE / 2.0 else 1.0] for other in further]
+    further = [other | {"normal": n} for other, n in zip(further, normals, strict=True)]
+    first = {"xyz": [0.0, 0.0, 0.0], "normal": [0.0, 0.0, 1.0]}
+    return entry | first | ({"further": further} if further else {})
+
+
+def place_entry(contact: Contact, with_normals: bool = False) -> Entry:
+    """Return the keys that say where an arm's hands or pads are."""
+    entries: list[Entry] = []
+    for pad in (contact, *contact.further):
+        R = pad.T_box_pad[:3, :3]
+        x, y, _ = pad_rotation(R[:, 2], 0.0).T @ R[:, 0]
+        entry: Entry = {"xyz": _plain(pad.T_box_pad[:3, 3]), "spin": _plain(np.arctan2(y, x))}
+        entries.append(entry | ({"normal": _plain(R[:, 2])} if with_normals else {}))
+    first, *further = entries
+    return first | ({"further": further} if further else {})
+
+
+def hand_places(
+    patterns: Sequence[Contact],
+    size: Array,
+    rotations: Array,
+    along: Array,
+    workcell: Callable[[list[Entry]], Workcell],
+) -> list[list[Entry]]:
+    """Return places of both arms' hands, those first that require the least share of their holding
+    force; none where the arms would cross.
+
+    Args:
+        patterns: both arms' hands in the axes of the first one, see `pattern_entry`.
+        size: (3,) edges of the box [m].
+        rotations: (n, 3, 3) R_world_box at the ends of the carry.
+        along: (3,) from robot 2 to robot 1, box frame; zeros if unknown.
+        workcell: reads the cell with these keys of both contacts.
+    """
+    pairs = [
+        (first, second)
+        for first, second in _pairs(patterns, size, rotations)
+        if (_points(first).mean(axis=0) - _points(second).mean(axis=0)) @ along > -EDGE
+    ]
+    if not pairs:
+        return []
+    cell = workcell([place_entry(contact) for contact in pairs[0]])
+    pairs = list(_with_tools_outside(cell, pairs))
+
+    def share(pair: Both) -> float:
+        required = required_at_rest(replace(cell, contacts=pair))
+        return round(float((required / cell.task.reference_force).max()), 3)
+
+    best = sorted(pairs, key=share)[:MOST_PLACES]
+    return [[place_entry(contact) for contact in pair] for pair in best]
+
+
+def _with_tools_outside(cell: Workcell, pairs: Sequence[Both]) -> Iterator[Both]:
+    """Yield those of both arms' hands whose tools do not enter the payload."""
+    bodies, arms = collision_bodies(cell), [arm_geometry(cell, arm) for arm in (0, 1)]
+    T_joint_pad = [
+        arm.T_joint_box @ contact.T_box_pad
+        for arm, contact in zip(arms, cell.contacts, strict=True)
+    ]
+    for pair in pairs:
+        held = [
+            T @ inverse(contact.T_box_pad) for T, contact in zip(T_joint_pad, pair, strict=True)
+        ]
+        if not any(tools_in_payload(bodies, held)):
+            yield pair
+
+
+def _pairs(patterns: Sequence[Contact], size: Array, rotations: Array) -> Iterator[Both]:
+    """Yield both arms' hands on faces that are free at both ends of the carry: cups and magnets on
+    opposite faces or on one, fingers at the edges of the thinnest side."""
+    quarters = np.pi / 2.0 * np.arange(4)
+    turned = [rotate_about_normal(pattern, quarters[1]) for pattern in patterns]
+    is_same = all(map(covers_the_same, patterns, turned))
+    grips = any(pattern.kind == "fingers" for pattern in patterns)
+    turns = [(turn, turn) for turn in quarters[: 1 if is_same else 2]]
+    for axis, side in product(range(3), (1.0, -1.0)):
+        outward = side * np.eye(3)[axis]
+        upward = (rotations @ outward)[:, 2]
+        pairs: list[tuple[Array, Array]] = []
+        if grips and size[axis] == size.min():
+            turns = list(product(quarters, quarters))
+            pairs = [(outward, -way) for way in BESIDE[::2]]
+        if not grips and upward.min() >= DOWNWARDS:
+            pairs = [(outward, -way) for way in BESIDE]
+            if upward.max() <= -DOWNWARDS:
+                pairs += [(-outward, way) for way in map(np.array, HEIGHTS)]
+        for (face, way), (one, other) in product(pairs, turns):
+            own_way = way if face is not outward else -way
+            first = _placed(patterns[0], outward, size, one, own_way)
+            second = _placed(patterns[1], face, size, other, way)
+            if first and second and not _overlap(first, second):
+                yield first, second
+
+
+def _placed(
+    pattern: Contact, outward: Array, size: Array, turn: float, place: Array
+) -> Contact | None:
+    """Return a pattern on a face of a box of edges (3,), None if it has no room there."""
+    face = pad_rotation(-outward, 0.0)
+    rotation = face @ pose_matrix(np.zeros(3), np.array([0.0, 0.0, turn]))[:3, :3]
+    reach = np.array([_reach(pad) for pad in (pattern, *pattern.further)])
+    low = (_points(pattern)[:, :2] - reach).min(axis=0)
+    high = (_points(pattern)[:, :2] + reach).max(axis=0)
+    half = np.abs(rotation[:, :2]) @ (high - low) / 2.0
+    room = np.abs(face[:, :2].T) @ (size / 2.0 - half) - EDGE
+    if (room < 0.0).any():
+        return None
+    middle = outward * size / 2.0 + face[:, :2] @ (room * place)
+    return moved(pattern, transform(rotation, middle - rotation[:, :2] @ (low + high) / 2.0))
+
+
+def _reach(pad: Contact) -> Array:
+    """Return half the extent (2,) of a patch along the axes of its pattern [m]."""
+    if pad.half_sides is None:
+        return np.full(2, pad.patch_radius)
+    return np.asarray(np.abs(pad.T_box_pad[:2, :2]) @ pad.half_sides)
+
+
+def _points(contact: Contact) -> Array:
+    return np.array([pad.T_box_pad[:3, 3] for pad in (contact, *contact.further)])
+
+
+def _overlap(one: Contact, other: Contact) -> bool:
+    """Return True if circles around the patches of both arms meet."""
+    apart = np.linalg.norm(_points(one)[:, None] - _points(other), axis=2)
+    return bool(apart.min() < one.patch_radius + other.patch_radius)
+
+
+def _plain(values: Any) -> Any:
+    return (np.round(values, 9) + 0.0).tolist()
