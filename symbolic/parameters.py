@@ -30,7 +30,7 @@ from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel
 from symbolic.contact.elastic import layer_shares
 from symbolic.contact.force_closure import dependent_components, grasp_shapes
-from symbolic.contact.holding_hands import internal_force_needs
+from symbolic.contact.holding_hands import internal_force_needs, weaker_shares
 from symbolic.contact.registry import command_model, contact_model
 from symbolic.contact.soft_finger import SoftPatch
 from symbolic.geometry.screen import Screen, ScreenBase, ScreenBody
@@ -289,10 +289,15 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
     own = {name: take(HELD, f"payload.{name}", getattr(payload, name)) for name in names}
     payload = _as(NumberedPayload, payload, **own, given=take.group(HELD))
     holds = any(contact.holding_force for contact in cell.contacts)
-    hands: Iterator[tuple[Array | None, Array | None]] = repeat((None, None))
+    hands: Iterator[dict[str, Any]] = repeat({})
     if holds:
         needs = internal_force_needs(cell.pads, cell.pad_robots)
-        hands = zip(layer_shares(cell.pads), needs, strict=True)
+        hands = (
+            {"share": share, "opposed": opposed, "weaker": weaker}
+            for share, opposed, weaker in zip(
+                layer_shares(cell.pads), needs, weaker_shares(cell.pads), strict=True
+            )
+        )
     contacts: Any = tuple(
         _contact(take, f"contacts[{i}]", contact, cell, hands)
         for i, contact in enumerate(cell.contacts)
@@ -398,9 +403,9 @@ def _contact(
     path: str,
     contact: Contact,
     cell: Workcell,
-    hands: Iterator[tuple[Array | None, Array | None]],
+    hands: Iterator[dict[str, Any]],
 ) -> Any:
-    share, opposed = next(hands)
+    hand = next(hands)
     pose = (take(HELD, f"{path} pose", part) for part in _split(contact.T_box_pad))
     patch = SoftPatch.of(contact, cell.contacts[0].T_box_pad[:3, :3])
     sides = contact.half_sides
@@ -419,9 +424,8 @@ def _contact(
         ),
         twist=take(HELD, f"{path} twist", patch.twist),
         spread=take(HELD, f"{path} spread", patch.spread),
-        share=None if share is None else take(HELD, f"{path} share", share),
-        opposed=None if opposed is None else take(HELD, f"{path} opposed", opposed),
         holding_force=0.0,
+        **{name: take(HELD, f"{path} {name}", value) for name, value in hand.items()},
     )
 
 

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from symbolic.array import Array
+from symbolic.contact.registry import contact_model
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
 from symbolic.records.problems import shown
@@ -155,8 +156,12 @@ def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
 
     With the least normal forces friction is fully used by construction. So the forces are raised to
     the reference forces. The needed coefficient is then F_t / (N_1 + N_2) with N_1 - N_2 = F_n; the
-    result is its share of the smaller friction coefficient.
+    result is its share of the smaller friction coefficient. Of hands that hold by themselves it is
+    the share of the friction of their whole holding force.
     """
+    if not contact_model(workcell).is_squeeze:
+        bearing = workcell.task.reference_force * [pad.friction for pad in workcell.contacts]
+        return np.asarray((outputs["tangential_force"] / bearing).max(axis=(1, 2)))
     force = outputs["normal_force"]
     difference = np.abs(force[:, :, 0] - force[:, :, 1])
     squeeze = 2.0 * float(workcell.task.reference_force.min()) - difference

@@ -358,9 +358,7 @@ def holding(
     load = model.load(box.pose, box.rate, box.second_rate)
     least, wrench = load["normal_force"], np.stack([load["wrench_1"], load["wrench_2"]], axis=1)
     extra, squeeze = extra_normal_force(model.workcell, settings, time, box, least)
-    normal = least + np.multiply.outer(
-        extra, command_model(model.workcell).internal_force_ratio(squeeze.leader)
-    )
+    normal = command_model(model.workcell).raised(least, extra, squeeze.leader)
     wrench = wrench + extra[:, None, None] * unit_squeeze(model.workcell, box.pose, squeeze.leader)
     cuts = np.cumsum([len(motion.time) for motion in motions])[:-1]
     parts = zip(*(np.split(values, cuts) for values in (normal, least, wrench)), strict=True)

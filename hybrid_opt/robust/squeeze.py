@@ -255,8 +255,8 @@ def largest_commanded(
     there, own = box.at(most), planned[most, follower]
     level = _in_every_case(workcell, uncertainty, leader, there, own).max()
     forces = np.full(2, _in_every_case(workcell, uncertainty, leader, box, level).max())
-    together = command_model(workcell).internal_force_ratio(leader)[leader]
-    forces[leader] = (planned[most, leader] + together * (forces[follower] - own)).max()
+    raised = command_model(workcell).raised(planned[most], forces[follower] - own, leader)
+    forces[leader] = raised[:, leader].max()
     return forces
 
 
@@ -266,7 +266,7 @@ def commanded_forces(
     """Compute the normal forces (n, 2) [N] to command along a carry.
 
     The planned force of the force-controlled arm rises by `extra_normal_force`; that of the leader
-    rises by `ContactModel.internal_force_ratio` times as much.
+    follows by `ContactModel.raised`.
 
     Args:
         workcell: the workcell.
@@ -280,8 +280,7 @@ def commanded_forces(
     """
     held = carry.normal_force
     extra, squeeze = extra_normal_force(workcell, settings, carry.time, carry, held, itemised)
-    together = command_model(workcell).internal_force_ratio(settings.leader)
-    return held + np.multiply.outer(extra, together), squeeze
+    return command_model(workcell).raised(held, extra, settings.leader), squeeze
 
 
 def smooth_above(time: Array, values: Array, width: float) -> Array:

@@ -140,10 +140,18 @@ def internal_force_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Arra
     return np.array(found)
 
 
+def weaker_shares(pads: Sequence[Contact]) -> list[float]:
+    """Return the least holding force of all hands over that of each."""
+    own = np.array([pad.holding_force for pad in pads])
+    return [float(share) for share in own.min() / np.maximum(own, FLOOR)]
+
+
 class HoldingHands(ContactModel):
     """Contact model of hands of both arms, any number and with any normals.
 
-    The normal force of an arm stands for the largest holding force that any of its hands needs. In
+    The normal force of an arm stands for the largest holding force that any of its hands needs. It
+    is stated for the weaker hands: forces of stronger ones are multiplied by the weaker holding
+    force over their own, so that a force of either arm is the same share of what its hands have. In
     worst cases the hands of both arms count together: no force is commanded, and one limit applies
     to both arms.
     """
@@ -164,13 +172,6 @@ class HoldingHands(ContactModel):
                 pads[0],
                 "is a pad, which only a squeeze holds; holding hands need kind = 'cup', 'magnet' "
                 "or 'fingers' and a holding_force on both arms",
-            )
-        first, second = (contact.holding_force for contact in self.workcell.contacts)
-        if first != second:
-            return (
-                "contacts[1].holding_force",
-                f"found {second:g} N, and {first:g} N on the other arm; allowed is the same on "
-                "both: a force limit is one for both arms",
             )
         return None
 
@@ -209,11 +210,13 @@ class HoldingHands(ContactModel):
         whole = ca.vertcat(in_box, about)
         needed, rubbed = [ca.SX(0.0), ca.SX(0.0)], [ca.SX(0.0), ca.SX(0.0)]
         forces, moments = ([ca.SX.zeros(3), ca.SX.zeros(3)] for _ in range(2))
-        for hand, i, share in zip(workcell.pads, workcell.pad_robots, self._shares, strict=True):
+        for hand, i, share, weaker in zip(
+            workcell.pads, workcell.pad_robots, self._shares, self._weaker, strict=True
+        ):
             own, friction = ca.mtimes(share, whole), load.friction[i]
             lifting, sliding = required_holding_forces(own, friction, HandPatch.of(hand))
-            needed[i] = ca.fmax(needed[i], ca.fmax(lifting, sliding))
-            rubbed[i] = ca.fmax(rubbed[i], _length(own[0], own[1]) - friction * own[2])
+            needed[i] = ca.fmax(needed[i], weaker * ca.fmax(lifting, sliding))
+            rubbed[i] = ca.fmax(rubbed[i], weaker * (_length(own[0], own[1]) - friction * own[2]))
             turn = ca.mtimes(box, number(hand.T_box_pad[:3, :3]))
             force = ca.mtimes(turn, own[:3])
             lever = ca.mtimes(box, number(hand.T_box_pad[:3, 3]) - places[i])
@@ -270,9 +273,14 @@ class HoldingHands(ContactModel):
         return np.asarray(way / np.linalg.norm(way))
 
     def held_with(self, commanded: Array) -> Array:
-        """Return the holding forces (n, 2) [N]. They do not depend on commanded forces."""
-        own = [contact.holding_force for contact in self.workcell.contacts]
-        return np.broadcast_to(own, commanded.shape)
+        """Return the holding force (n, 2) of the weaker hands [N]. It does not depend on commanded
+        forces."""
+        weakest = min(contact.holding_force for contact in self.workcell.contacts)
+        return np.full(commanded.shape, weakest)
+
+    def raised(self, planned: Array, extra: Array, leader: int) -> Array:
+        """Return the same force (n, 2) for the hands of both arms, which count together [N]."""
+        return np.repeat((planned[:, 1 - leader] + extra)[:, None], 2, axis=1)
 
     def pulled_apart(self, along: Array, across: Array, stiffness: float) -> tuple[Array, Array]:
         """Return zero changes (n,) of the normal forces, and rises (n,) of the least forces, if the
@@ -285,9 +293,19 @@ class HoldingHands(ContactModel):
         """Return the largest additional holding force that one newton between the arms requires of
         a hand."""
         most = ca.SX(0.0)
-        for (a, b, lifting), i in zip(self._opposed, self.workcell.pad_robots, strict=True):
-            most = ca.fmax(most, ca.fmax(a / friction[i] + b, lifting))
+        for (a, b, lifting), i, weaker in zip(
+            self._opposed, self.workcell.pad_robots, self._weaker, strict=True
+        ):
+            most = ca.fmax(most, weaker * ca.fmax(a / friction[i] + b, lifting))
         return most
+
+    @property
+    def _weaker(self) -> list[Any]:
+        """Per hand the weaker holding force over its own; symbols if the cell's numbers are."""
+        pads = self.workcell.pads
+        if isinstance(pads[0], NumberedContact):
+            return [pad.weaker for pad in pads if isinstance(pad, NumberedContact)]
+        return weaker_shares(pads)
 
     @property
     def _opposed(self) -> list[list[Any]]:

@@ -274,6 +274,11 @@ class ContactModel(ABC):
         presses beyond its planned force."""
         return np.ones(2)
 
+    def raised(self, planned: Array, extra: Array, leader: int) -> Array:
+        """Return the forces (n, 2) to command if that of the following robot rises by `extra` (n,)
+        beyond its planned one [N]."""
+        return planned + np.multiply.outer(extra, self.internal_force_ratio(leader))
+
     def displacement_margin(self, uncertainty: Uncertainty) -> float:
         """Return the distance by which displacements may still grow until forces can no longer be
         computed [m]; zero or less if the uncertainty exceeds the range."""

@@ -75,7 +75,7 @@ def read_task(table: TableReader, holding: Array) -> tuple[Task, tuple[Redundanc
     redundant = read_redundant(table, len(waypoints))
     holds, given = bool(holding.any()), {}
     if holds:
-        given["reference_force"] = read_only(holding)
+        given["reference_force"] = read_only(np.full(2, holding[holding > 0.0].min()))
         if table.has("reference_force"):
             table.add("reference_force", "found beside holding_force of the contacts, its value")
     task = table.record(

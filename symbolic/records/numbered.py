@@ -68,12 +68,14 @@ class NumberedContact(Contact):
         twist, spread: lengths of the patch (`symbolic.contact.soft_finger.SoftPatch`).
         share: for a hand, its matrix of `symbolic.contact.elastic.layer_shares`.
         opposed: for a hand, its row of `symbolic.contact.holding_hands.internal_force_needs`.
+        weaker: for a hand, the least holding force of all hands over its own.
     """
 
     twist: Any = None
     spread: Any = None
     share: Any = None
     opposed: Any = None
+    weaker: Any = None
 
 
 @dataclass(frozen=True)

@@ -344,12 +344,68 @@ def test_what_does_not_fit_hands_is_refused(tmp_path: Path, old: str, new: str, 
         load(tmp_path / "cell.toml")
 
 
-def test_hands_of_both_arms_hold_with_the_same_force(tmp_path: Path) -> None:
+def with_holding_forces(cell: Workcell, forces: tuple[float, float]) -> Workcell:
+    """Return a cell as its file with these holding forces of the arms' hands [N] is read."""
+    first, second = (
+        replace(
+            contact,
+            holding_force=force,
+            further=tuple(replace(pad, holding_force=force) for pad in contact.further),
+        )
+        for contact, force in zip(cell.contacts, forces, strict=True)
+    )
+    task = replace(cell.task, reference_force=np.full(2, min(forces)))
+    return replace(cell, contacts=(first, second), task=task)
+
+
+STRENGTHS = [(140.0, 280.0), (300.0, 100.0), (50.0, 50.0)]
+
+
+@pytest.mark.parametrize("name", CELLS)
+@pytest.mark.parametrize("forces", STRENGTHS)
+def test_a_force_is_the_same_share_of_the_hands_of_either_arm(
+    name: str, forces: tuple[float, float]
+) -> None:
+    """What hands need does not depend on what they have."""
+    cell = with_holding_forces(hands_cell(name), forces)
+    motion = np.random.default_rng(2).normal(0.0, 0.4, (3, 6))
+    needs = call(load_of_cell(name), *motion)["normal_force"]
+    found = call(load_function(cell), *motion)["normal_force"]
+    np.testing.assert_allclose(found / cell.task.reference_force, needs / np.array(forces))
+    held = contact_model(cell).held_with(found)
+    np.testing.assert_allclose(found / held, needs / np.array(forces))
+
+
+@pytest.mark.parametrize("name", CELLS)
+def test_robust_forces_follow_the_hands_that_need_the_larger_share(name: str) -> None:
+    """Stronger hands of one arm lower the share that both need, and only until the other arm
+    decides; hands that are all stronger need the same force."""
+    cell, rng = hands_cell(name), np.random.default_rng(1)
+    motion = BoxMotion(*rng.normal(0.0, 0.3, (3, 4, 6)))
+
+    def commanded(first: float, second: float) -> Array:
+        model = interpreted_robust_model(with_holding_forces(cell, (first, second)))
+        force = model.robust_force(motion)
+        assert (force.commanded == force.leading).all()
+        assert model.check(motion, force, 200, np.random.default_rng(3)).holds
+        return np.asarray(force.commanded)
+
+    equal = commanded(140.0, 140.0)
+    np.testing.assert_allclose(commanded(200.0, 200.0), equal, rtol=1e-9)
+    alone = [commanded(140.0, 1e5), commanded(1e5, 140.0)]
+    np.testing.assert_allclose(np.max(alone, axis=0), equal, rtol=1e-9)
+    between = commanded(140.0, 160.0)
+    assert (between <= equal * (1.0 + 1e-9)).all()
+    assert (between >= alone[0] * (1.0 - 1e-9)).all()
+
+
+def test_hands_of_unequal_force_are_read(tmp_path: Path) -> None:
     text = standing_text(RACK.with_name("palletising.toml"))
     text = text.replace("holding_force = 140.0", "holding_force = 120.0", 1)
     (tmp_path / "cell.toml").write_text(text)
-    with pytest.raises(WorkcellError, match="the same on both"):
-        load(tmp_path / "cell.toml")
+    task = load(tmp_path / "cell.toml").task
+    assert task.reference_force.tolist() == [120.0, 120.0]
+    assert task.force_limit[1] == 120.0
 
 
 def test_what_squeezes_is_refused_to_hands() -> None:
