@@ -20,6 +20,7 @@ from hybrid_opt.display_protocol import Displayable
 from hybrid_opt.errors import JobError
 from hybrid_opt.evaluate.objectives import ROBUST_FORCE, ForceKind
 from hybrid_opt.front import Front
+from hybrid_opt.job.compliance import separation
 from hybrid_opt.job.plan import CommandedForces, command_forces, job_model
 from hybrid_opt.job.records import Job
 from hybrid_opt.job.smooth import driven_timing
@@ -55,6 +56,7 @@ from hybrid_opt.timing.robustness import Margin
 from symbolic.array import Array, Figure, evenly
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell, quantities
+from symbolic.records.cell import PARTNER_TIME
 
 HAND_MADE = "hand-made"
 """Name of the workcell file's own trajectory."""
@@ -338,6 +340,17 @@ def _objections(found: CommandedForces) -> list[str]:
         doubts.append(f"no job can be planned: {found.problem}")
     if squeeze.uncertainty is not None and squeeze.uncertainty.is_empty:
         doubts.append("the cell states that nothing is uncertain: state what may be off")
+    job = found.job
+    allowed = None if job is None else job.workcell.handling.partner_stop
+    if job is not None and allowed is not None:
+        # The timing limits the speed of the box's centre alone.
+        apart = separation(job, PARTNER_TIME)
+        if apart > allowed * (1.0 + BETTER):
+            doubts.append(
+                f"the box turns, too: one arm's own stop moves the pads {1e3 * apart:.0f} mm "
+                f"apart, not {1e3 * allowed:.0f} mm; time it with partner_stop = "
+                f"{allowed**2 / apart:.3f}"
+            )
     return doubts
 
 

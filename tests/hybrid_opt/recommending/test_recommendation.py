@@ -32,6 +32,7 @@ from symbolic.path.pieces import resample_decisions
 from symbolic.read.cell import changed
 from symbolic.records import USUAL_UNCERTAINTY, Contact, Task
 from symbolic.records.cell import RANGES
+from symbolic.records.poses import box_rotation
 from tests.hybrid_opt import cells
 from tests.hybrid_opt.robust.test_force import SMALL as SET
 from tests.hybrid_opt.robust.test_force import model, motion
@@ -165,7 +166,19 @@ def test_the_cost_of_a_partners_stop_is_told(
     other = answer.rivals[-1]
     assert "without partner_stop" in repr(answer)
     assert found.duration < other.duration_at_force < answer.duration
-    assert not [text for text in answer.warnings if "partner_stop" in text]
+    # Each pad also turns with the box: what it moves in that time, by the poses alone.
+    motion, cell, apart = answer.carry, slow.workcell, 0.0
+    time = np.linspace(0.0, motion.time[-1], 2000)
+    pose = np.column_stack([np.interp(time, motion.time, column) for column in motion.pose.T])
+    turned = box_rotation(cell.task.orientation, pose)
+    later = np.searchsorted(time, time + 0.2, side="right") - 1
+    for contact in cell.contacts:
+        pad = pose[:, :3] + turned @ contact.T_box_pad[:3, 3]
+        apart = max(apart, float(np.linalg.norm(pad[later] - pad, axis=1).max()))
+    told = [text for text in answer.warnings if "partner_stop" in text]
+    assert bool(told) == (apart > 0.0601)
+    if told:
+        assert f"{1e3 * apart:.0f} mm apart, not 60 mm" in told[0]
 
 
 def test_more_payload_takes_more_force(drivable: ho.Cell, front: ho.Front) -> None:
