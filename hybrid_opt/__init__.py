@@ -78,10 +78,11 @@ if TYPE_CHECKING:
 
 
 def _require_own(package: str, member: str) -> None:
-    """Refuse a package of this name from another project, which hides the one that is needed.
+    """Check that an imported package is part of this project, and not of another one with the same
+    name.
 
     Raises:
-        ImportError: the package has no such member.
+        ImportError: the package has no such member, so it belongs to another project.
     """
     try:
         found = find_spec(f"{package}.{member}")
@@ -106,7 +107,8 @@ _HOMES = {
     for each in node.names
     if each.asname
 }
-"""Modules of the names above, which are imported for type checkers only."""
+"""Name of the module that defines each public name, read from the imports above, which only type
+checkers execute."""
 
 __all__ = sorted(_HOMES)
 

@@ -30,14 +30,14 @@ from symbolic.records import SEARCHED_BRANCH
 from symbolic.records.time_law import RAMPED
 
 SAMPLED = 32
-"""Random candidates of which a pair has to hold one, where it does not hold the hand-made
-trajectory."""
+"""Number of random candidates tried with each pair of start branches. A pair takes part only if
+both arms can follow one of them, or the hand-made trajectory."""
 
 LEAST_EVALUATIONS = 24
-"""Least evaluations of a pair in a round: fewer tell nothing."""
+"""Least number of evaluations of a pair in one round; fewer would not allow a comparison."""
 
 BEST = 10
-"""Candidates that a pair's next round begins with."""
+"""Number of a pair's best candidates with which its next round starts."""
 
 _HOLDING = [
     k
@@ -48,15 +48,16 @@ _HOLDING = [
 
 @dataclass(frozen=True)
 class PairResult:
-    """Result of a pair of start branches.
+    """Result of a pair of start branches, one for each robot.
 
     Attributes:
-        branches: of both robots, among the ranked ones.
-        rounds: rounds in which it took part, 0 where it holds no trajectory that was tried.
-        evaluations: evaluations that it was given.
-        feasible_share: feasible share of these.
-        hypervolume: hypervolume of the front that it found.
-        least_penalty: least mean of its penalised objectives.
+        branches: index of each robot's branch in the ranked list of its branches.
+        rounds: number of rounds in which the pair took part; 0 if the arms could follow none of the
+            trajectories tried.
+        evaluations: number of candidates evaluated with the pair.
+        feasible_share: share of these candidates that are feasible.
+        hypervolume: hypervolume of the front of these candidates.
+        least_penalty: least mean of the penalised objectives over these candidates.
     """
 
     branches: tuple[int, int]
@@ -69,12 +70,13 @@ class PairResult:
 
 @dataclass(frozen=True)
 class BranchCompetition:
-    """All pairs, best first: by rounds, then by hypervolume, then by penalty.
+    """Result of a competition between pairs of start branches.
 
     Attributes:
-        pairs: their results.
-        evaluations: of all pairs together.
-        law: name of the time law under which they competed.
+        pairs: results of all pairs, the best first: sorted by rounds, then hypervolume, then
+            penalty.
+        evaluations: number of candidates evaluated with all pairs together.
+        law: name of the time law of the evaluations.
     """
 
     pairs: tuple[PairResult, ...]
@@ -83,7 +85,7 @@ class BranchCompetition:
 
     @property
     def winner(self) -> tuple[int, int]:
-        """The branches to take."""
+        """Indices of both robots' branches in the best pair."""
         return self.pairs[0].branches
 
     def __str__(self) -> str:
@@ -109,7 +111,7 @@ class BranchCompetition:
 
 
 class _Pair:
-    """One pair and its evaluations so far."""
+    """A pair of start branches, and all candidates evaluated with it so far."""
 
     def __init__(self, branches: tuple[int, int], evaluator: CandidateEvaluator) -> None:
         self.branches, self.evaluator = branches, evaluator
@@ -117,7 +119,7 @@ class _Pair:
         self._parts: list[Evaluations] = []
 
     def search(self, algorithm: str, evaluations: int, rng: np.random.Generator) -> None:
-        """Search for one more round."""
+        """Run one more round: a search that starts with the best candidates so far."""
         known = concatenated(self._parts)
         order = np.argsort(known.penalised.mean(axis=1), kind="stable")
         settings = SearchSettings(initial=known.x[order[: min(BEST, evaluations)]])
@@ -126,13 +128,13 @@ class _Pair:
         self.rounds += 1
 
     def try_out(self, x: Array) -> bool:
-        """Return True if both arms hold one of some candidates."""
+        """Return True if both arms can follow at least one of the candidates (n, n_var)."""
         found = self.evaluator.evaluate(x)
         self._parts.append(found)
         return bool(np.any(np.all(found.violation[:, _HOLDING] <= 0.0, axis=1)))
 
     def result(self) -> PairResult:
-        """Return its present result."""
+        """Return the result of the pair so far."""
         known = concatenated(self._parts)
         rows = front_rows(known.objectives, known.feasible)
         volume = hypervolume(known.objectives[rows], REFERENCE_POINT) if len(rows) else 0.0
@@ -154,22 +156,24 @@ def search_branches(
     algorithm: str = "nsga2",
     progress: ShowProgress = False,
 ) -> BranchCompetition:
-    """Let all pairs of start branches compete that hold the hand-made trajectory or a sampled one.
+    """Find the best pair of start branches by a competition. Pairs take part with which both arms
+    can follow the hand-made trajectory or one of some random ones.
 
-    A robot whose `start_branch` is a number keeps it.
+    For a robot whose `start_branch` in the workcell file is a number, only this branch takes part.
 
     Args:
         cell: the cell.
-        evaluations: approximate budget of the competition; at least `LEAST_EVALUATIONS` per pair
-            and round, beside those in which pairs are tried out.
-        rng: its only randomness.
-        algorithm: that searches.
-        progress: True for a bar, or a function of searches done and in all.
+        evaluations: approximate number of evaluations in all. Each pair gets at least
+            `LEAST_EVALUATIONS` per round; the random trajectories tried first come in addition.
+        rng: random generator; the same state gives the same result.
+        algorithm: name of the search algorithm.
+        progress: True for a progress bar, or a function that is called with the number of searches
+            done and their total.
 
     Raises:
-        SettingsError: candidates of this cell are not evaluated in lanes, or it has not two
-            objectives.
-        WorkcellError: no pair holds any trajectory that was tried.
+        SettingsError: candidates of this cell cannot be evaluated with other start branches, or the
+            cell does not have two objectives.
+        WorkcellError: with no pair the arms can follow any trajectory tried.
     """
     if cell.workcell.task.law.is_drivable:
         cell = _from_rest_to_rest(cell)
@@ -213,7 +217,7 @@ def search_branches(
 
 
 def _from_rest_to_rest(cell: Cell) -> Cell:
-    """Return the cell under 'ramped', with the paper's objectives."""
+    """Return the cell with the time law 'ramped' and the paper's objectives."""
     task = replace(cell.workcell.task, time_law=RAMPED)
     return Cell(replace(cell.workcell, task=task), PAPER_OBJECTIVES, cell.threads)
 

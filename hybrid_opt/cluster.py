@@ -21,16 +21,16 @@ from hybrid_opt.workers import (
 from symbolic.errors import DualArmError, SettingsError
 
 CONNECT_SECONDS = 15.0
-"""Time that the scheduler, and then a first worker, may take to answer."""
+"""Time that the scheduler may take to answer, and then a first worker [s]."""
 
 LOST_SECONDS = 10.0
-"""Time without its scheduler after which the work is given up."""
+"""Time without a connection to the scheduler after which the work is given up [s]."""
 
 _CONNECTION_INTERVAL = 1.0
-"""Interval at which the connection is looked at [s]."""
+"""Time between two checks of the connection [s]."""
 
 _CONNECTED = "running"
-"""Dask's name for a client that has its scheduler."""
+"""Dask's name for the status of a client that is connected to its scheduler."""
 
 _alone = Lock()
 """Held during a call: what workers load serves one thread at a time."""
@@ -39,18 +39,18 @@ Environment = Mapping[str, str]
 
 
 class DaskWorkers(Workers):
-    """Makes calls on the workers of a Dask cluster, which repeats calls lost with a worker.
+    """Makes calls on the workers of a Dask cluster. Dask repeats the calls of a lost worker.
 
-    Workers need this package and its dependencies in the same versions, and a C compiler.
+    The workers need this package and its dependencies in the same versions, and a C compiler.
     """
 
     def __init__(self, address: str, environment: Callable[[], Environment]) -> None:
-        """Connect to nothing yet.
+        """Store the address; the connection is made by the first call.
 
         Args:
-            address: of the scheduler.
-            environment: describes the software of the process that it is called in; workers whose
-                software differs are refused.
+            address: address of the scheduler, as tcp://HOST:8786.
+            environment: function that describes the software of the process in which it is called;
+                workers with other software are refused.
         """
         self._address, self._environment = address, environment
         self._resources = ExitStack()
@@ -59,7 +59,7 @@ class DaskWorkers(Workers):
     def _results(
         self, function: Callable[[Argument], Result], arguments: Sequence[Argument]
     ) -> Iterator[tuple[int, Result]]:
-        """Yield index and result of each call as it ends.
+        """Yield the index and the result of each call, in the order in which the calls end.
 
         Raises:
             SettingsError: Dask is not installed, or no scheduler or worker answers.
@@ -84,7 +84,7 @@ class DaskWorkers(Workers):
                 self._give_up("does not answer any more")
 
     def close(self) -> None:
-        """Disconnect; calls that are not finished are cancelled."""
+        """Disconnect; unfinished calls are cancelled."""
         with self._resources:
             self._client = None
 
@@ -130,7 +130,12 @@ class DaskWorkers(Workers):
 
 
 def _require_address(address: str) -> None:
-    """Refuse an invalid address: a client without a valid one waits, and complains when it ends."""
+    """Check the form of a scheduler's address. A Dask client with an invalid address would wait,
+    and print errors when it ends.
+
+    Raises:
+        SettingsError: the address is invalid.
+    """
     from distributed.comm import addressing
 
     host_port: Any = addressing.get_address_host_port  # untyped
@@ -146,7 +151,8 @@ def _require_address(address: str) -> None:
 
 @contextmanager
 def _without_tracebacks() -> Iterator[None]:
-    """Keep Dask from logging tracebacks of a lost connection, which an error of ours reports."""
+    """Keep Dask from logging tracebacks of a lost connection inside the `with` block; this project
+    reports the loss by an error of its own."""
     loggers = [logging.getLogger(name) for name in ("distributed", "distributed.client")]
     levels = [logger.level for logger in loggers]
     try:
@@ -164,7 +170,12 @@ def _call(
     function: Callable[[Argument], Result],
     argument: Argument,
 ) -> Result:
-    """Call a function on a worker, after comparing its software with the wanted one."""
+    """Call a function on a worker, after a check that the worker's software equals the `wanted`
+    description.
+
+    Raises:
+        DualArmError: the software differs.
+    """
     found = environment()
     for name in sorted({*found, *wanted}):
         if found.get(name) != wanted.get(name):

@@ -12,13 +12,16 @@ from typing import Any, Protocol
 
 
 def display(room: str) -> Any:
-    """Import a module that displays objects: 'objects' as text and HTML, 'scene' in three
-    dimensions."""
+    """Import one of the modules that display objects.
+
+    Args:
+        room: 'objects' for text and HTML, or 'scene' for three-dimensional views.
+    """
     return import_module(f"hybrid_opt.display.{room}")
 
 
 class Displayable:
-    """An object that has a text and a page."""
+    """Base class of objects that are shown as text in a terminal and as HTML in a notebook."""
 
     def __repr__(self) -> str:
         return str(display("objects").text_of(self))
@@ -28,12 +31,12 @@ class Displayable:
 
 
 class Page(Protocol):
-    """A self-contained page, which a notebook shows in a cell."""
+    """A self-contained HTML page, which a notebook shows in a cell."""
 
     def page(self) -> str:
-        """Return its text."""
+        """Return the HTML text of the page."""
 
     def save(self, path: str | Path) -> None:
-        """Write it into a file."""
+        """Write the page to a file."""
 
     def _repr_html_(self) -> str: ...

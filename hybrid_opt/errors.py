@@ -12,19 +12,19 @@ class DamagedResultsWarning(DualArmWarning):
 
 
 class DisplayError(DualArmError):
-    """An object cannot be shown: a library that draws is missing, or a file not writable."""
+    """An object cannot be shown: a graphics library is missing, or a file cannot be written."""
 
 
 class WorkerError(DualArmError):
-    """Worker processes or machines were lost, or their software differs."""
+    """Worker processes or remote workers were lost, or have other software."""
 
 
 class SimulationError(DualArmError):
-    """The simulator is missing, or cannot answer."""
+    """The simulator is not installed, or cannot simulate the cell or the motion."""
 
 
 class NoCarryError(ResultsError):
-    """A study found no carry to recommend; the text says why."""
+    """A study found no carry to recommend; the message says why."""
 
 
 class JobError(DualArmError):
@@ -32,8 +32,8 @@ class JobError(DualArmError):
 
 
 class ProposalError(DualArmError):
-    """No carry was found for a problem; the text names the obstacle."""
+    """No carry was found for a problem file; the message names the obstacle."""
 
 
 class NoHoldError(ProposalError):
-    """No way was found to hold the box at start and goal, so that no path was sought."""
+    """No way was found to hold the box at start and goal, so no path was searched for."""

@@ -13,23 +13,27 @@ from tqdm import TqdmWarning, tqdm
 T = TypeVar("T")
 
 ShowProgress = Literal[False, True] | Callable[[int, int], None]
-"""Whether to show a bar, or what is called with the units done and those in all."""
+"""True for a progress bar, False for none, or a function that is called with the number of units
+done and the total."""
 
 
 class Advance(Protocol):
-    """Takes the number of further units done, and the total if it has changed."""
+    """Function that reports progress: it takes the number of further units done, and the total if
+    that has changed."""
 
     def __call__(self, count: int, total: int | None = None, /) -> None:
-        """Advance the progress."""
+        """Report that `count` further units are done, of `total` in all if that has changed."""
 
 
 @contextmanager
 def progress_bar(progress: ShowProgress, what: str, total: int) -> Iterator[Advance]:
-    """Count the units of a call.
+    """Show the progress of a call inside the `with` block, as the caller chose. Yield the function
+    that reports progress.
 
     Args:
-        what: stands before the bar.
-        total: units in all.
+        progress: how to show it.
+        what: text in front of the bar.
+        total: number of units in all.
     """
     if progress is True:
         with warnings.catch_warnings():
@@ -57,7 +61,7 @@ def progress_bar(progress: ShowProgress, what: str, total: int) -> Iterator[Adva
 
 
 def as_callback(advance: Advance) -> Callable[[int, int], None]:
-    """Adapt an open progress bar to a `progress(done, total)` callback."""
+    """Return a function of (done, total) that reports to an open progress bar."""
     before = 0
 
     def tell(done: int, total: int) -> None:
@@ -75,7 +79,13 @@ def _set_total(bar: tqdm[NoReturn], total: int | None) -> None:
 
 
 def track(progress: ShowProgress, what: str, items: Sequence[T]) -> Iterator[T]:
-    """Yield the items of a call, counting each when the next is requested."""
+    """Yield items and show progress: an item counts as done when the next one is requested.
+
+    Args:
+        progress: how to show it.
+        what: text in front of the bar.
+        items: the items.
+    """
     with progress_bar(progress, what, len(items)) as advance:
         for item in items:
             yield item
@@ -83,15 +93,15 @@ def track(progress: ShowProgress, what: str, items: Sequence[T]) -> Iterator[T]:
 
 
 _QUIET_SECONDS = 10.0
-"""Between lines where the terminal is none, as in a log."""
+"""Least time between two progress lines where standard error is not a terminal, as in a log [s]."""
 
 
 class Progress:
-    """Shows one stage at a time as a line on standard error.
+    """Shows the progress of a program's current stage in one line on standard error.
 
     Attributes:
         shown: False to show nothing.
-        of: name in front of the stages' titles.
+        of: name in front of the titles of stages.
     """
 
     def __init__(self, shown: bool = True, of: str = "") -> None:
@@ -102,14 +112,15 @@ class Progress:
     def stage(
         self, title: str, total: int, unit: str, done: int = 0, delay: float = 0.0
     ) -> Iterator[Advance]:
-        """Show a line during the `with` block.
+        """Show a line of progress inside the `with` block. Yield the function that reports
+        progress.
 
         Args:
-            title: the current work.
-            total: units in all.
-            unit: name of a counted unit.
-            done: units that an earlier attempt did.
-            delay: shorter work is not shown [s].
+            title: name of the stage.
+            total: number of units in all.
+            unit: name of the units, as 'replicas'.
+            done: number of units that an earlier attempt finished.
+            delay: time before the line appears, so that short work is not shown [s].
         """
         bar = tqdm(
             total=total,
@@ -135,6 +146,6 @@ class Progress:
             yield advance
 
     def note(self, text: str) -> None:
-        """Print a line of its own."""
+        """Print a separate line."""
         if self.shown:
             tqdm.write(text, file=sys.stderr)

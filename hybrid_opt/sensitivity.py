@@ -39,10 +39,12 @@ from symbolic.records import Workcell
 from symbolic.records.task import waypoints_of
 
 NUMBER_STEP = 1e-5
-"""Half the distance of two cells nearby, in the number's unit."""
+"""Half the difference of a number between the two neighbouring cells from which derivatives are
+computed, in the number's unit."""
 
 LEAST_EFFECT = 1e-7
-"""Share of force or duration that a usual change has to move for a number to be told."""
+"""Least relative change of force or duration by a usual change of a number with which the number is
+listed."""
 
 POSE_UNITS = ("m",) * 3 + ("rad",) * 3
 
@@ -94,7 +96,8 @@ UNCERTAINTY_UNITS = {
     "relative_angle": "rad",
     "stiffness": "N/m",
 }
-"""Units by key; of a joint that slides m stands for rad, and N for N m."""
+"""Units of the entries of [uncertainty] by key. For sliding joints m stands for rad, and N for N
+m."""
 
 USUAL_CHANGES = {
     "": 0.01,
@@ -110,20 +113,23 @@ USUAL_CHANGES = {
     "N m": 1.0,
     "N/m": 1000.0,
 }
-"""A usual change by unit: what is compared and shown."""
+"""Size of a usual change of a number by unit. Sensitivities are sorted and shown for this
+change."""
 
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """Effect of one number.
+    """Effect of one number of the workcell file on a carry.
 
     Attributes:
-        key: in the workcell file; of one entry of an array with its index.
-        value: of the number [unit].
-        force: of the force per unit that the number rises [N/unit].
-        lowered_force: likewise per unit that it falls; other than `-force` where several cases
-            rule.
-        duration, lowered_duration: likewise of the duration [s/unit]; None where it is missing.
+        key: key path in the workcell file, with an index for one entry of an array.
+        value: value of the number [unit].
+        unit: unit of the number, as text.
+        force: change of the force per unit by which the number rises [N/unit].
+        lowered_force: change of the force per unit by which the number falls [N/unit]; it differs
+            from `-force` where the governing case changes.
+        duration, lowered_duration: the same for the duration [s/unit]; None where it cannot be
+            computed.
     """
 
     key: str
@@ -136,20 +142,22 @@ class Sensitivity:
 
     @property
     def change(self) -> float:
-        """A usual one [unit]."""
+        """Size of a usual change of the number [unit]."""
         return float(USUAL_CHANGES[self.unit])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Sensitivities(Displayable):
-    """Sensitivities of a carry to the numbers of a cell, the largest first; others have no effect.
+    """Effects of the numbers of a workcell file on a carry's force and duration. Numbers without
+    effect are left out.
 
     Attributes:
         workcell: the cell.
-        force: the largest to command that holds in every case of the uncertainty [N].
+        force: the largest commanded force that holds in every case of the uncertainty [N].
         duration: of the carry [s].
-        rows: by how much a usual change moves force or duration.
-        missing: by key why a number has no sensitivity, or none of the duration.
+        rows: effect of each number, the largest effect of a usual change first.
+        missing: for numbers whose effect, or whose effect on the duration, cannot be computed: the
+            reason by key.
     """
 
     workcell: Workcell
@@ -159,17 +167,18 @@ class Sensitivities(Displayable):
     missing: Mapping[str, str]
 
     def __getitem__(self, key: str) -> Sensitivity:
-        """Return the sensitivity of a key.
+        """Return the effect of the number with this key.
 
         Raises:
-            KeyError: the number does nothing, or its sensitivity is missing.
+            KeyError: the number has no effect, or its effect cannot be computed.
         """
         return {row.key: row for row in self.rows}[key]
 
 
 @dataclass(frozen=True)
 class _Number:
-    """A number of a workcell file. index: in an array, None of one alone."""
+    """One number of a workcell file. `index` is its position in an array, None for a single number;
+    `whole` is the value of the key, a number or an array."""
 
     path: str
     index: int | None
@@ -198,17 +207,19 @@ class _Number:
 
 
 def sensitivities(carry: Carry | Timing, *, progress: ShowProgress = False) -> Sensitivities:
-    """Compute the derivatives of a carry's force and duration by the numbers of its cell.
+    """Compute the derivatives of a carry's force and duration with respect to all numbers of its
+    cell.
 
     Args:
-        carry: under the time law of its task; or the fastest timing of a path within limits. Of a
-            timing the force is that of the same motion, and the duration that of the fastest one
-            within the same limits, a limit of force included.
-        progress: True for a bar, or a function of numbers done and in all.
+        carry: a carry under the time law of its task, or the fastest timing of a path within
+            limits. For a timing, the duration is that of the fastest timing within the same limits
+            in the changed cell; the force is that of the unchanged motion.
+        progress: True for a progress bar, or a function that is called with the number of file
+            numbers done and their total.
 
     Raises:
-        SettingsError: the carry has another timing, a timing limits robust forces or is not the
-            fastest, or the uncertainty leaves nothing that holds.
+        SettingsError: the carry has another timing, the timing limits robust forces or is not the
+            fastest, or the uncertainty leaves no force that holds.
     """
     drive = _Law(carry) if isinstance(carry, Carry) else _Fastest(carry)
     workcell, ruling = drive.carry.workcell, GoverningForce(drive.carry, LEADER)
@@ -271,16 +282,18 @@ class _Law:
         return number.section == "task"
 
     def is_compiled_with(self, number: _Number, workcell: Workcell) -> bool:
-        """Return True if the duration in another cell requires compiling."""
+        """Return True if the duration in the cell changed by this number needs newly compiled
+        functions."""
         return False
 
     def durations(self, number: _Number, low: Workcell, high: Workcell) -> tuple[float, float]:
-        """Compute the changes of the duration towards the higher and the lower of two cells [s]."""
+        """Return the changes of the duration from the present cell to the one with the higher
+        number, and to the one with the lower number [s]."""
         before, after = (float(self._driven(cell)[0][-1, 0]) for cell in (low, high))
         return (after - before) / 2.0, (before - after) / 2.0
 
     def motion(self, workcell: Workcell, samples: NDArray[np.intp]) -> BoxMotion:
-        """Compute the motion at some samples, in another cell."""
+        """Compute the motion in another cell, at the samples with these indices."""
         return BoxMotion(*[part[samples] for part in self._driven(workcell)[1:]])
 
     def _driven(self, workcell: Workcell) -> list[Array]:
@@ -292,8 +305,8 @@ class _Law:
 
 
 class _Fastest:
-    """The fastest timing of a path, in neighbouring cells: its speeds are fixed, and the duration
-    follows from the limits' ratios at these speeds."""
+    """The fastest timing of a path, in neighbouring cells. The path speeds are fixed; the change of
+    the duration follows from the ratios to the limits at these speeds."""
 
     def __init__(self, timing: Timing) -> None:
         if timing.limits.robust:
@@ -313,14 +326,15 @@ class _Fastest:
         return number.section != "uncertainty"
 
     def is_compiled_with(self, number: _Number, workcell: Workcell) -> bool:
-        """Return True if another cell requires compiling: upright bases that are tilted, or moved
-        pads with any normals."""
+        """Return True if a cell changed by this number needs newly compiled functions: if an
+        upright base becomes tilted, or if pads whose normals are not opposite move."""
         if number.is_limit or not self.moved_by(number):
             return False
         return WorkcellParameters(workcell).digest != self._digest
 
     def durations(self, number: _Number, low: Workcell, high: Workcell) -> tuple[float, float]:
-        """Compute the changes of the duration towards the higher and the lower of two cells [s]."""
+        """Return the changes of the duration from the present cell to the one with the higher
+        number, and to the one with the lower number [s]."""
         before, after = (self._ratios(number, cell) for cell in (low, high))
         return self._near.changes(before, after)
 
@@ -332,7 +346,7 @@ class _Fastest:
         return CarryLimits(workcell).ratios(carry, self._limits)
 
     def motion(self, workcell: Workcell, samples: NDArray[np.intp]) -> BoxMotion:
-        """Compute the motion at some samples, in another cell."""
+        """Compute the motion in another cell, at the samples with these indices."""
         points, speeds = waypoints_of(workcell.task, self.carry.x), self._near.speeds
         basis = path_basis(len(points), self.carry.parameter[samples])
         first, second = basis.first @ points, basis.second @ points
@@ -344,8 +358,8 @@ class _Fastest:
 
 
 def _numbers(workcell: Workcell) -> Iterator[_Number]:
-    """Yield all numbers of the sensitivities, as the file states them, or else with their
-    defaults."""
+    """Yield all numbers whose effects are computed, with the values that the workcell file states
+    or the defaults."""
     text = workcell.text or safe_io.read_bytes(workcell.source, safe_io.WORKCELL_BYTES)
     data = safe_io.toml_tables(text)
     yield from _of(data["payload"], "payload", PAYLOAD_UNITS, workcell.payload)

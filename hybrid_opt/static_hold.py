@@ -32,7 +32,7 @@ Outputs = Callable[[Array], dict[str, Array]]
 """Function from decision vectors (n, n_var) to all per-sample output arrays by name."""
 
 REMEDY_BISECTIONS = 24
-"""Bisections for the mass or the friction that would do."""
+"""Number of bisections for the mass or the friction with which the payload could be held."""
 
 
 @dataclass(frozen=True)
@@ -211,13 +211,13 @@ def require_hold(workcell: Workcell, outputs: Outputs | None = None) -> None:
 
 
 def hold_error(workcell: Workcell, told: str) -> WorkcellError:
-    """Return the error for a payload that cannot be held at rest; `told` is the reason."""
+    """Return the error of a payload that cannot be held at rest, with the reason `told`."""
     return WorkcellError(str(workcell.source), (f"payload: {told}",))
 
 
 def _ends(workcell: Workcell, outputs: Outputs) -> list[tuple[Array, Array]]:
-    """Return both arms' joints at the start and the goal of the hand-made trajectory, if
-    reached."""
+    """Return both arms' joint positions at the start and at the goal of the hand-made trajectory;
+    nothing for an end that the arms do not reach."""
     found = outputs(initial_decision(workcell.task)[None])
     return [
         (found["q_1"][0, sample], found["q_2"][0, sample])
@@ -242,7 +242,8 @@ class _Still:
             self._models = [build_robot_model(robot) for robot in workcell.robots]
 
     def exceeded(self, mass: float = 1.0, friction: float = 1.0) -> list[StaticUtilisation]:
-        """Return the limits that are exceeded with other factors on mass and friction."""
+        """Return the exceeded limits if the payload's mass and the friction coefficients are
+        multiplied by factors."""
         found = []
         for where, pose in self._poses.items():
             load = still_load(self._workcell, pose, friction)
@@ -271,7 +272,13 @@ class _Still:
     def _torques(
         self, where: str, load: dict[str, Array], mass: float
     ) -> Iterator[StaticUtilisation]:
-        """Yield the most used joint of each arm, if its posture is known."""
+        """Yield for each arm the use of its most loaded joint, if the arm's posture is known.
+
+        Args:
+            where: end of the path, 'start' or 'goal'.
+            load: contact forces and moments of the payload at rest.
+            mass: factor on the payload's mass.
+        """
         from symbolic.robot.arm import joint_torque
 
         workcell = self._workcell
@@ -288,7 +295,8 @@ class _Still:
             yield StaticUtilisation(TORQUE, whose, where, float(torque[joint]), float(most), unit)
 
     def remedy(self, exceeded: list[StaticUtilisation]) -> str:
-        """Find the mass or friction that would suffice, each with everything else unchanged."""
+        """Return a text with the mass and the friction with which the exceeded limits would be
+        kept, each with everything else unchanged."""
         ways = []
         if any(use.quantity != PRESSURE for use in exceeded):
             ways = [way for way in (self._mass(), self._friction()) if way]
@@ -319,13 +327,14 @@ class _Still:
         return f"friction of at least {wanted}"
 
     def _bears(self, mass: float = 1.0, friction: float = 1.0) -> bool:
-        """Return True if forces and torques are within their limits."""
+        """Return True if forces and torques are within their limits with factors on mass and
+        friction."""
         return all(use.quantity == PRESSURE for use in self.exceeded(mass, friction))
 
 
 def _nearest(enough: Callable[[float], bool], here: float, far: float) -> float | None:
-    """Find the nearest sufficient factor between one that fails and `far`, None if `far` fails
-    as well."""
+    """Return the factor nearest to `here`, between `here` and `far`, for which `enough` returns
+    True; None if it returns False at `far`."""
     if not enough(far):
         return None
     for _ in range(REMEDY_BISECTIONS):

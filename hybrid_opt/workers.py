@@ -36,13 +36,14 @@ Result = TypeVar("Result")
 OnResult = Callable[[int, Any], None]
 
 MAX_DEATHS = 3
-"""Deaths of workers, with no result in between, after which the work is given up."""
+"""Number of worker processes that may end unexpectedly between two results before the work is given
+up."""
 
 RESUME_HINT = "what was computed is kept: continue with --resume"
 
 
 def ignore_result(index: int, result: object) -> None:
-    """Do nothing with a result."""
+    """Do nothing; the default for calls without a function that handles results."""
 
 
 class Workers(ABC):
@@ -79,7 +80,7 @@ class Workers(ABC):
     def _results(
         self, function: Callable[[Argument], Result], arguments: Sequence[Argument]
     ) -> Iterator[tuple[int, Result]]:
-        """Yield index and result of each call as it ends."""
+        """Yield the index and the result of each call, in the order in which the calls end."""
 
     @abstractmethod
     def close(self) -> None:
@@ -180,7 +181,8 @@ def finished(calls: dict[Future[Result], int]) -> Iterator[tuple[int, Result]]:
 
 
 def call_safely(function: Callable[[Argument], Result], argument: Argument) -> Result:
-    """Call a function with one linear-algebra thread; convert errors to picklable ones."""
+    """Call a function with one linear-algebra thread. Errors that cannot be pickled are converted
+    to errors that can."""
     try:
         with one_thread():
             return function(argument)
@@ -203,8 +205,8 @@ def one_thread() -> AbstractContextManager[object]:
 
 @lru_cache(maxsize=1)
 def _controller(modules: int) -> ThreadpoolController:
-    """Return the controller of the libraries loaded with this number of modules: a new one takes
-    4 ms."""
+    """Return the controller of the threads of all loaded linear-algebra libraries. It is cached by
+    the number of loaded modules, because a new one takes 4 ms."""
     return ThreadpoolController()
 
 
@@ -225,8 +227,8 @@ def warm_up(*modules: str) -> None:
 def _without_interrupts() -> Iterator[None]:
     """Keep Ctrl-C from processes that are started in the `with` block, and from their children.
 
-    It is sent to the whole group, but the parent alone decides what it means. The mask is
-    inherited, so that it holds from a process's first moment.
+    A terminal sends Ctrl-C to all processes of a group, but the parent alone decides how to end the
+    work. Children inherit the blocked signal from their first moment on.
     """
     # Lifts the mask when it starts for the first time.
     resource_tracker.ensure_running()
@@ -239,8 +241,8 @@ def _without_interrupts() -> Iterator[None]:
 
 @contextmanager
 def _interrupts_later() -> Iterator[None]:
-    """Raise Ctrl-C at the end of the `with` block only: a process whose start it interrupts would
-    be lost."""
+    """Delay Ctrl-C until the end of the `with` block, so that a process cannot be lost while it is
+    started."""
     if current_thread() is not main_thread():
         yield
         return
@@ -255,12 +257,13 @@ def _interrupts_later() -> Iterator[None]:
 
 
 def _live(lifeline: Connection) -> None:
-    """Begin a worker's life, which ends with the lifeline: with the pool, or with the parent."""
+    """Start a thread in a new worker process that ends the process when the pool or the parent
+    process ends."""
     Thread(target=_end_with, args=(lifeline,), daemon=True).start()
 
 
 def _end_with(lifeline: Connection) -> None:
-    """End this process, also in the midst of a call, when the other end of a pipe is closed."""
+    """End this process, even during a call, as soon as the other end of a pipe is closed."""
     with suppress(EOFError, OSError):
         lifeline.recv()
     os._exit(1)

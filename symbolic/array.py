@@ -43,7 +43,8 @@ class Range:
         return f"{self.low:g} to {self.high:g} {self.unit}".rstrip()
 
     def suspicion(self, value: float) -> str:
-        """Name another unit in which a value outside the range was probably written, or ''."""
+        """Return the name of a unit in which a value outside the range was probably written by
+        mistake, '' if there is none."""
         for name, factor in self.mistaken:
             if math.isfinite(value) and value != 0 and self.contains(value * factor):
                 return (
@@ -83,7 +84,7 @@ class AllowMissing:
 
 
 Figure = Annotated[float, AllowMissing()]
-"""A number, NaN or infinite where there is none."""
+"""A number; NaN or infinite if the value does not exist."""
 
 Count = Annotated[int, Range(0, 10**12)]
 
@@ -98,7 +99,8 @@ Row = Annotated[Array, Shape((None,))]
 
 
 def interpolated(at: Array, along: Array, values: Array) -> Array:
-    """Interpolate values (n, ...), known at ascending `along` (n,), linearly at `at` (m,)."""
+    """Interpolate linearly at positions `at` (m,) between values (n, ...) that are known at
+    ascending positions `along` (n,). Return (m, ...)."""
     found = np.empty((len(at), *values.shape[1:]))
     for column in np.ndindex(values.shape[1:]):
         every = (slice(None), *column)
@@ -107,7 +109,8 @@ def interpolated(at: Array, along: Array, values: Array) -> Array:
 
 
 def evenly(count: int, most: int) -> NDArray[np.intp]:
-    """Return at most `most` of `count` row indices, evenly spread, including both ends."""
+    """Return the indices of at most `most` of `count` rows, evenly spread, the first and the last
+    included."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(np.intp)
 
 
@@ -119,15 +122,16 @@ def set_read_only(record: object) -> None:
 
 
 def require_allowed(settings: object, whose: str = "") -> None:
-    """Refuse a settings record with a value that its annotations do not allow: not one of a
-    `Literal`, or outside a `Range`. None is allowed if the annotation allows it.
+    """Raise an error if a settings record holds a value that its annotations do not allow: a value
+    that is not one of a `Literal`, or a number outside a `Range`. None passes if the annotation
+    allows it.
 
     Args:
         settings: the settings record.
-        whose: text at the front of the message, which names the owner of the settings.
+        whose: text at the front of the message that names the owner of the settings.
 
     Raises:
-        SettingsError: with the value and the allowed ones.
+        SettingsError: a value is not allowed; the message states the value and the allowed ones.
     """
     for name, kind in get_type_hints(type(settings), include_extras=True).items():
         value: Any = getattr(settings, name)

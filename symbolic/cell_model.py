@@ -42,24 +42,26 @@ class CellBodies:
 
     @cached_property
     def screen(self) -> Screen:
-        """Numbers behind the bounds of distances."""
+        """Parameters of the formulas for distance bounds."""
         return screen_of(self.geometry)
 
     @cached_property
     def screening(self) -> dict[str, ca.Function]:
-        """The functions of `symbolic.geometry.clearance.screening_functions`."""
+        """The compiled functions of distance bounds, by name;
+        `symbolic.geometry.clearance.screening_functions` describes them."""
         placements = (self.robots[0].joint_placements, self.robots[1].joint_placements)
         return screening_functions(self.geometry, placements, screen=self.screen)
 
 
 @dataclass(frozen=True, eq=False)
 class CellModel(CellBodies):
-    """Everything that the symbolic model of a cell is built from.
+    """A workcell with its arms, bodies and start postures, from which all functions of the cell are
+    built.
 
     Attributes:
-        branches: per arm every branch at the start, best first.
+        branches: for each arm all inverse-kinematics branches at the start, the best first.
         start: (n,) joint positions of each arm at the first waypoint [rad].
-        given: the parameter group of the start postures where these are symbols.
+        given: the parameter group of the start postures if these are symbols, else empty.
     """
 
     branches: tuple[tuple[StartBranch, ...], tuple[StartBranch, ...]]
@@ -68,14 +70,16 @@ class CellModel(CellBodies):
 
 
 def build_cell_bodies(workcell: Workcell, known: CellBodies | None = None) -> CellBodies:
-    """Read the robots and the bodies, in a fifth of the time of the whole model.
+    """Read the models of both robots and all bodies of a workcell, without start postures. It takes
+    a fifth of the time of `build_cell_model`.
 
     Args:
-        known: arms and bodies of a cell that differs in its path or in how it holds the box.
-            Functions are shared where the same pairs can meet.
+        workcell: the description of the cell.
+        known: arms and bodies of a cell that differs only in the path, or in how the pads hold the
+            box. Compiled functions are reused if the same pairs can collide.
 
     Raises:
-        RobotModelError: a URDF does not give an arm.
+        RobotModelError: a URDF does not describe a usable arm.
         CollisionModelError: a collision shape is unusable.
     """
     task = workcell.task
@@ -90,7 +94,7 @@ def build_cell_bodies(workcell: Workcell, known: CellBodies | None = None) -> Ce
 
 
 def _compared(bodies: CellBodies) -> tuple[object, ...]:
-    """Return the pairs that the functions compare, in blocks."""
+    """Return the pairs between which functions compute distances, grouped in blocks."""
     return bodies.geometry.possible, bodies.geometry.near
 
 
@@ -100,19 +104,22 @@ Searches = tuple[ArmSearch, ArmSearch]
 def build_cell_model(
     workcell: Workcell, bodies: CellBodies | None = None, searches: Searches | None = None
 ) -> CellModel:
-    """Read the robots, list all start branches and choose one per arm.
+    """Read the models of both robots and all bodies of a workcell, list all start branches of each
+    arm, and choose one per arm.
 
-    The workcell's `start_branch` selects one of the ranked branches; -1 is the best.
+    The index `start_branch` in the workcell selects one of the ranked branches; -1 selects the
+    best.
 
     Args:
-        bodies: arms and bodies of the same cell, if known; the path of that cell may differ.
-        searches: search functions of both arms' start branches; None for the interpreted
-            functions.
+        workcell: the description of the cell.
+        bodies: arms and bodies of a cell that differs only in the path; None to read them.
+        searches: compiled functions that search for the start branches of both arms; None for
+            interpreted ones.
 
     Raises:
-        RobotModelError: a URDF does not give an arm.
+        RobotModelError: a URDF does not describe a usable arm.
         CollisionModelError: a collision shape is unusable.
-        WorkcellError: an arm cannot reach the start, or a chosen branch does not exist.
+        WorkcellError: an arm cannot reach the start, or the selected branch does not exist.
     """
     bodies = bodies or build_cell_bodies(workcell)
     robots, geometry = bodies.robots, bodies.geometry
@@ -146,8 +153,8 @@ def build_cell_model(
 
 
 def own_pairs(geometry: CellGeometry, arm: int) -> list[int]:
-    """Return the active pairs of one arm's bodies with anything except the other arm; the still
-    part of a machine belongs to neither arm."""
+    """Return the indices of the active pairs between a body of one arm and anything but the other
+    arm. Parts of the machine that no joint moves belong to neither arm."""
     own, other = (f"robot {i + 1}" for i in (arm, 1 - arm))
     groups = [
         {geometry.bodies[body].group for body in (pair.first, pair.second)}
@@ -157,12 +164,13 @@ def own_pairs(geometry: CellGeometry, arm: int) -> list[int]:
 
 
 def own_clearance(geometry: CellGeometry, arm: int, bounds: Bounds) -> Clearance:
-    """Return a function of one arm's least clearance bound [m] over samples, the other arm left
-    out.
+    """Return a function of the least distance bound [m] between one arm and anything but the other
+    arm, over all samples of a motion.
 
     Args:
-        bounds: function from box poses (n, 6) and both arms' joints to the distance bounds of
-            all pairs.
+        geometry: the collision bodies and pairs.
+        arm: index of the arm.
+        bounds: function of the distance bounds of all pairs.
     """
     rows = own_pairs(geometry, arm)
 
@@ -177,7 +185,8 @@ def own_clearance(geometry: CellGeometry, arm: int, bounds: Bounds) -> Clearance
 
 
 Bounds = Callable[[Array, Array, Array], Array]
-"""Poses (n, 6) and both arms' joints (n, joints) to lower bounds (n, n_pairs) of distances [m]."""
+"""Function from box poses (n, 6) and the joint positions of both arms, (n, joints) each, to lower
+bounds of the distances of all active pairs (n, n_pairs) [m]."""
 
 
 def _interpreted(workcell: Workcell, bodies: CellBodies) -> Searches:

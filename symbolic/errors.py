@@ -7,7 +7,7 @@ import re
 
 
 class DualArmError(Exception):
-    """Root of all errors raised on purpose by this project; the text says what to do."""
+    """Base class of all errors that this project raises on purpose; the message says what to do."""
 
     def __init__(self, text: str = "", *, code: str = "") -> None:
         super().__init__(text)
@@ -15,9 +15,11 @@ class DualArmError(Exception):
 
     @property
     def code(self) -> str:
-        """Name of the mistake for programs, such as `not-json`, which stays when the text changes.
+        """Identifier of the kind of error for programs, such as `not-json`. It stays the same when
+        the message changes.
 
-        An error that passes another one on has its code; one without any has its class's name.
+        An error that was caused by another one has the code of the cause. An error without a code
+        has the name of its class.
         """
         cause = self.__cause__
         if not self._code and isinstance(cause, DualArmError):
@@ -27,18 +29,19 @@ class DualArmError(Exception):
 
 
 class DualArmWarning(UserWarning):
-    """Root of all warnings of this project; the text says what is different and what to do."""
+    """Base class of all warnings of this project; the message says what differs from the
+    expectation and what to do."""
 
 
 class OutsideError(DualArmError):
-    """A file from outside is refused; the text says why, but not which file it is."""
+    """A file of unknown origin is refused. The message says why but does not name the file."""
 
 
 class WorkcellError(DualArmError):
     """A workcell description is wrong.
 
     Attributes:
-        problems: every problem found, each `key.path: what was found; what is allowed`.
+        problems: all problems found, each as `key.path: what was found; what is allowed`.
     """
 
     def __init__(self, source: str, problems: tuple[str, ...]) -> None:
@@ -50,15 +53,15 @@ class WorkcellError(DualArmError):
 
 
 class RobotModelError(DualArmError):
-    """A robot's URDF cannot be turned into the model that a computation needs."""
+    """No usable model of an arm can be made from a robot's URDF."""
 
 
 class UrdfError(RobotModelError):
     """A URDF file is wrong.
 
     Attributes:
-        file: its name, without its folder.
-        problems: every problem found, each `element attribute: what was found; what is allowed`.
+        file: name of the file, without its folder.
+        problems: all problems found, each as `element attribute: what was found; what is allowed`.
     """
 
     def __init__(self, file: str, problems: tuple[str, ...]) -> None:
@@ -68,11 +71,12 @@ class UrdfError(RobotModelError):
 
 
 class SceneError(DualArmError):
-    """A scene of another program cannot be read; the text names its file and every problem."""
+    """A scene of another program cannot be read. The message names the file and all problems."""
 
 
 class BridgeError(DualArmError):
-    """Code compiled at installation is missing, or was built for other versions."""
+    """The code that is compiled during installation is missing, or was built for other versions of
+    the libraries."""
 
 
 class CollisionModelError(DualArmError):

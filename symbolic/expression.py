@@ -15,17 +15,20 @@ Expression: TypeAlias = ca.SX | ca.MX
 
 
 def reciprocal(x: ca.SX) -> ca.SX:
-    """Compute 1 / x for multiplication: CasADi turns x * (1 / y) into a division, which costs ten
-    times as much as a product."""
+    """Return an expression of 1 / x to multiply by. CasADi would otherwise turn x * (1 / y) into a
+    division, which costs ten times as much as a product."""
     return 2.0 / (x + x)
 
 
 def named_function(
     name: str, inputs: Mapping[str, Any], outputs: Mapping[str, Any], cse: bool = True
 ) -> ca.Function:
-    """Build a function from named inputs and outputs, in order.
+    """Build a CasADi function with named inputs and outputs, in the order of the mappings.
 
     Args:
+        name: of the function.
+        inputs: symbols by name.
+        outputs: expressions by name.
         cse: whether common subexpressions are computed once.
     """
     sides = [*inputs.values()], [*outputs.values()], [*inputs], [*outputs]
@@ -33,40 +36,48 @@ def named_function(
 
 
 def number(value: Any) -> Any:
-    """Return a number or an array of a record as an expression; symbols unchanged."""
+    """Return a number or an array of a record as a CasADi expression. Symbols are returned
+    unchanged."""
     return value if isinstance(value, ca.SX | ca.MX) else ca.DM(value)
 
 
 def sx_parameters(*records: Any) -> dict[str, ca.SX]:
-    """Return the parameter groups of some records by input name, each once; empty for plain
-    records."""
+    """Return the symbolic parameters in records as vectors by the name of their group; empty for
+    records of plain numbers."""
     groups = (group for record in records if (group := getattr(record, "given", None)) is not None)
     return {group.name: group.symbols for group in groups}
 
 
 def mx_parameters(*records: Any) -> dict[str, ca.MX]:
-    """Return the groups of `sx_parameters` as new MX symbols, for functions that pass them on."""
+    """Return new MX symbols for the parameter groups in records, by name. Functions of MX use them
+    as inputs and pass them on to functions of SX."""
     return mx_symbols(sx_parameters(*records))
 
 
 def mx_symbols(given: Mapping[str, ca.SX]) -> dict[str, ca.MX]:
-    """Return MX symbols for parameter groups."""
+    """Return new MX symbols of the same sizes for parameter groups, by name."""
     return {name: ca.MX.sym(name, symbols.numel()) for name, symbols in given.items()}
 
 
 def select_parameters(handed: Mapping[str, ca.MX], *records: Any) -> dict[str, ca.MX]:
-    """Select the symbols of `mx_parameters` that belong to some records."""
+    """Return those of the symbols `handed` whose parameter groups occur in the given records."""
     return {name: handed[name] for name in sx_parameters(*records)}
 
 
 def as_mx(value: ca.SX, given: Mapping[str, ca.SX], handed: Mapping[str, ca.MX]) -> ca.MX:
-    """Return an SX expression of parameters as an MX expression of the symbols of
-    `mx_parameters`."""
+    """Convert an SX expression of parameters to an MX expression.
+
+    Args:
+        value: the expression.
+        given: the SX parameters by group.
+        handed: the MX symbols by group, from `mx_parameters`.
+    """
     if not given:
         return ca.MX(ca.evalf(value))
     return ca.Function("numbers", list(given.values()), [value])(*handed.values())
 
 
 def tile(given: Mapping[str, ca.MX], n: int) -> list[ca.MX]:
-    """Repeat parameters once per column, as `casadi.Function.map` takes them."""
+    """Return the parameter groups repeated n times side by side, as the n calls of
+    `casadi.Function.map` need them."""
     return [ca.repmat(symbols, 1, n) for symbols in given.values()]

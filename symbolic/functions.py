@@ -59,13 +59,14 @@ Limits and singularity of a lost arm are unknown and count as satisfied; its los
 """
 
 DRIVE_INPUTS = ("drive_time", "drive_speed", "drive_acceleration")
-"""(n,) times [s], u' [1/s] and u'' [1/s^2] at the samples, found by a solver."""
+"""Names of the inputs that describe the timing of a drivable candidate: (n,) times [s], u' [1/s]
+and u'' [1/s^2] at the samples, found by a solver."""
 
 TIMING_TOLERANCE = 5e-3
-"""Excess over a limit that a timing may have, as a share of it (`hybrid_opt.timing.solve`)."""
+"""Allowed excess of a timing over a limit, as a share of the limit (`hybrid_opt.timing.solve`)."""
 
 FRICTION_TOLERANCE = 1e-9
-"""Rounding allowed in a tight friction cone, as a share of the payload's weight."""
+"""Excess over a friction cone that counts as rounding, as a share of the payload's weight."""
 
 
 def candidate_function(model: CellModel) -> ca.Function:
@@ -115,7 +116,7 @@ def candidate_function(model: CellModel) -> ca.Function:
 
 
 def _all(model: CellModel) -> dict[str, ca.MX]:
-    """Return the parameters of a whole candidate."""
+    """Return MX symbols for all parameter groups that the evaluation of a candidate uses."""
     workcell = model.workcell
     return mx_parameters(workcell.task, *workcell.robots, model, workcell.payload)
 
@@ -134,11 +135,12 @@ def _constraints(
 
 
 def motion_function(model: CellModel) -> ca.Function:
-    """Build the evaluator of one candidate's motion, without forces; not for drivable cells.
+    """Build the function of one candidate's motion, without forces. It does not exist for drivable
+    cells.
 
-    Inputs: x (n_var,), then the cell's parameters. Outputs, with the shapes and units that
-    `candidate_function` gives: time, pose, q_1, q_2, and violation (9,). The violations of
-    friction and pressure are 0.
+    Inputs: x (n_var,), then the cell's parameters. Outputs, with shapes and units as in
+    `candidate_function`: time, pose, q_1, q_2, and violation (9,), in which the entries of friction
+    and pressure are 0.
     """
     workcell = model.workcell
     n = workcell.task.samples
@@ -176,12 +178,13 @@ _LOAD_SIZES = {
 }
 
 FORCE_CONSTRAINTS = CONSTRAINTS[6:]
-"""Constraints that depend on the contact forces."""
+"""Names of the constraints that depend on the contact forces."""
 
 SAMPLE_NAMES = frozenset(
     (*_LOAD_SIZES, *(f"{name}_{i}" for i in (1, 2) for name in TRACK_OUTPUTS), "constraint")
 )
-"""Outputs of `sample_functions`' `sample` after the states."""
+"""Names of all outputs that the function `sample` of `sample_functions` may have after the two
+states."""
 
 
 def sample_sizes(workcell: Workcell) -> dict[str, int]:
@@ -198,10 +201,8 @@ def sample_sizes(workcell: Workcell) -> dict[str, int]:
 
 
 def forces_come_last(workcell: Workcell) -> bool:
-    """Return True if the contact model has no closed form, so that a program solves for forces.
-
-    The forces of a candidate are then computed only if its motion violates no constraint.
-    """
+    """Return True if the contact model has no closed form, so that an optimisation computes the
+    forces. These are then computed only for candidates whose motion violates no constraint."""
     return not contact_model(workcell).has_closed_form
 
 
@@ -276,11 +277,12 @@ def sample_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def kernel_numbers(workcell: Workcell, screen: Screen) -> dict[str, tuple[str, ...]]:
-    """Return the parameter groups that each of `kernel_functions` takes after its other inputs, in
-    order.
+    """Return, for each function of `kernel_functions` by name, the names of the parameter groups
+    that it takes after its other inputs, in order.
 
     Args:
-        workcell, screen: the cell and its distance bounds, with parameters.
+        workcell: the cell, with symbolic parameters.
+        screen: the parameters of its distance bounds, symbolic too.
     """
     arms, held = tuple(sx_parameters(*workcell.robots)), tuple(sx_parameters(workcell.payload))
     bodies = tuple(sx_parameters(screen))
@@ -404,8 +406,8 @@ def arm_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def cell_functions(model: CellModel) -> dict[str, ca.Function]:
-    """Build the functions of `arm_functions` and of
-    `symbolic.geometry.clearance.screening_functions`."""
+    """Build all compiled functions of a cell by name: those of `arm_functions`, and the distance
+    bounds of `symbolic.geometry.clearance.screening_functions`."""
     return arm_functions(model) | model.screening
 
 
@@ -438,12 +440,16 @@ def kernel_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def timing_functions(model: CellModel, samples: int) -> dict[str, ca.Function]:
-    """Build the functions for the timing of one workcell.
+    """Build the functions for the timing of paths in one workcell, by name.
 
-    path_motion: see `symbolic.path_motion`, at that many samples. load, uncertain_load: see
-    `symbolic.contact.load`. arm_i per arm i = 1, 2: see
-    `symbolic.path_motion.arm_derivative_function`. path_force, where the normal forces have slopes:
-    see `symbolic.limit_coefficients.path_force_function`.
+    path_motion: path geometry at uniform samples, see `symbolic.path_motion`. load, uncertain_load:
+    contact forces, see `symbolic.contact.load`. arm_1, arm_2: derivatives of an arm's motion, see
+    `symbolic.path_motion.arm_derivative_function`. path_force, only if the normal forces have
+    derivatives: see `symbolic.limit_coefficients.path_force_function`.
+
+    Args:
+        model: the cell.
+        samples: number of samples of path_motion.
     """
     workcell = model.workcell
     functions = {

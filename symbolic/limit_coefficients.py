@@ -87,7 +87,8 @@ def path_function(model: CellModel, samples: int) -> ca.Function:
 
 
 def sample_limits_function(model: CellModel) -> ca.Function:
-    """Return `PATH_OUTPUTS` of one sample -> its coefficients, limits (size,) by `limit_layout`."""
+    """Return the function from `PATH_OUTPUTS` of one sample to the coefficients of all limits
+    there, a vector laid out by `limit_layout`."""
     workcell = model.workcell
     payload, task, layout = workcell.payload, workcell.task, limit_layout(workcell)
     given = [ca.SX.sym(name, task.extended_size) for name in ("pose", "first", "second")]
@@ -141,13 +142,20 @@ def sample_limits_function(model: CellModel) -> ca.Function:
 
 
 def limit_numbers(workcell: Workcell) -> dict[str, ca.SX]:
-    """Return the parameters that `sample_limits_function` takes after its other inputs."""
+    """Return the symbolic parameters that `sample_limits_function` takes after its other inputs, by
+    group."""
     return sx_parameters(workcell.task, *workcell.robots, workcell.payload)
 
 
 def _contact_load(workcell: Workcell, blocks: dict[str, ca.SX], a: ca.SX, w: ca.SX) -> ContactLoad:
-    """Return the load of the contacts along the axes of contact 1 from the blocks force and
-    moment."""
+    """Return the load of the contacts at one sample, along the axes of contact 1.
+
+    Args:
+        workcell: the cell.
+        blocks: the blocks force and moment of `limit_layout`.
+        a: second derivative u'' of the path parameter.
+        w: square u'^2 of its first derivative.
+    """
     by = [blocks["force"][3 * k : 3 * k + 3] for k in range(3)]
     axes, centre = workcell.contacts[0].T_box_pad[:3, :3], workcell.payload.centre_of_mass
     arms = [ca.SX(number(axes.T @ (c.T_box_pad[:3, 3] - centre))) for c in workcell.contacts]
@@ -196,8 +204,9 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
 
 
 def _load_function(workcell: Workcell) -> ca.Function:
-    """Return blocks force and moment of `limit_layout`, u'' and u'^2 -> the load (6,) about the box
-    frame's origin, box axes, and its derivatives (6, 2) by u'' and u'^2."""
+    """Return the function from the blocks force and moment of `limit_layout`, u'' and u'^2 to the
+    load (6,) about the box frame's origin, along the box's axes [N, N m], and its derivatives (6,
+    2) by u'' and u'^2."""
     size = limit_layout(workcell).sizes["force"]
     payload = workcell.payload
     axes, centre = number(workcell.contacts[0].T_box_pad[:3, :3]), number(payload.centre_of_mass)
@@ -213,8 +222,9 @@ def _load_function(workcell: Workcell) -> ca.Function:
 
 
 def path_force_function(workcell: Workcell) -> ca.Function:
-    """Return box pose and its derivatives by u (6,), u'' and u'^2 -> normal_force (2,) [N] and
-    slope (2, 2), of each force by u'' and by u'^2."""
+    """Return the function from the box pose and its first and second derivative by u (6,), u''
+    and u'^2 to normal_force (2,) [N] and slope (2, 2), the derivatives of each force by u'' and
+    u'^2."""
     closed, payload = contact_model(workcell).has_closed_form, workcell.payload
     kind, given = (ca.SX, sx_parameters) if closed else (ca.MX, mx_parameters)
     numbers: dict[str, Any] = dict(given(payload))
@@ -271,17 +281,18 @@ def contact_limits(
     timing: tuple[ca.SX, ca.SX],
     implicit: ImplicitVariables,
 ) -> tuple[ca.SX, ca.SX]:
-    """Return limits on the contact forces at one sample.
+    """Return the limited quantities of the contact forces at one sample.
 
     Args:
         workcell: the cell.
-        blocks: force, moment, torque and wrench; see `limit_layout`.
+        blocks: the blocks force, moment, torque and wrench of `limit_layout`.
         timing: u'' and u'^2.
-        implicit: see `ImplicitVariables`.
+        implicit: variables that other equations determine, see `ImplicitVariables`.
 
     Returns:
-        Ratios (joints + 2,): joint torques over their limits, signed, then the shifts of both
-        centres of pressure over their patch radii; `ContactModel.force_quantities` (2,) [N].
+        Ratios (joints + 2,) to the limits: signed joint torques, then the shifts of both centres of
+        pressure over their patch radii; and the quantities (2,) of `ContactModel.force_quantities`
+        [N].
     """
     (a, w), joints = timing, limit_layout(workcell).joints
     model, load = contact_model(workcell), _contact_load(workcell, blocks, a, w)
@@ -302,7 +313,8 @@ def contact_limits(
 
 
 def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
-    """Return `ratio_functions` if a program finds the forces."""
+    """Return the two functions of `ratio_functions` for a cell in which an optimisation computes
+    the forces."""
     layout = limit_layout(workcell)
     sizes, joints = layout.sizes, layout.joints
     names = ("force", "moment", "torque", "wrench")
@@ -339,7 +351,7 @@ def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
 
 
 def _inputs(workcell: Workcell, blocks: dict[str, ca.SX]) -> dict[str, ca.SX]:
-    """Return the inputs of `limit_forces`, from blocks of a sample."""
+    """Return the inputs of the function `limit_forces` by name, from the blocks of a sample."""
     timing = {name: ca.SX.sym(name) for name in ("a", "w")}
     return {"sample": ca.vertcat(*blocks.values())} | timing | sx_parameters(workcell.payload)
 
@@ -347,7 +359,8 @@ def _inputs(workcell: Workcell, blocks: dict[str, ca.SX]) -> dict[str, ca.SX]:
 def _slopes(
     name: str, value: ca.SX, inputs: dict[str, ca.SX], implicit: ImplicitVariables
 ) -> ca.Function:
-    """Return a value and its derivatives by u'' and u'^2, from inputs and solved variables."""
+    """Return the function from inputs and solved variables to an expression and to its derivatives
+    by u'' and u'^2."""
     value = ca.densify(value)
     by = {f"by_{z}": ca.densify(ca.jacobian(value, inputs[z])) for z in ("a", "w")}
     return named_function(name, inputs | {"solved": implicit.symbols}, {"value": value} | by)

@@ -15,11 +15,13 @@ import numpy as np
 from symbolic.records import Workcell
 
 Scope = Literal["joint", "payload", "robot"]
-"""One value per joint of both arms, one of the payload, or one per robot."""
+"""Number of values of a limit: one per joint of both arms, one for the payload, or one per
+robot."""
 
 SlackGroup = Literal["motion", "force", "ratio"]
-"""Limits that are tightened together between grid points: on motion alone, on the convex normal
-forces, and on ratios of the contact forces, which are not convex."""
+"""Groups of limits between whose kinds the compiled passes distinguish when they tighten limits
+between grid points: limits on motion alone, on the convex normal forces, and on ratios of contact
+forces, which are not convex."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +58,8 @@ class Limit:
 
     @property
     def is_signed(self) -> bool:
-        """Return True if the limited quantity has both signs, each with the same limit."""
+        """Return True if the limited quantity may be positive or negative, with the same limit in
+        both directions."""
         return self.block in ("acceleration", "torque")
 
 

@@ -38,10 +38,10 @@ MOST_BYTES = 512 * MEBIBYTE
 """Largest file that is read."""
 
 MAX_JSON_VALUES = 1_000_000
-"""Most values of one JSON document: each takes up to about 200 bytes once it is read."""
+"""Largest number of values in one JSON document; each takes up to about 200 bytes of memory."""
 
 MAX_NESTING = 50
-"""Deepest nesting of JSON and TOML values."""
+"""Largest depth of nested values in JSON and TOML."""
 
 _KINDS = (
     (stat.S_ISDIR, "a folder"),
@@ -67,7 +67,7 @@ def resolved(path: Path) -> Path:
     """Return the absolute path of an existing file, with symbolic links resolved.
 
     Raises:
-        OutsideError: there is none, or the links lead in a circle.
+        OutsideError: the file does not exist, or links lead in a circle.
     """
     try:
         return path.resolve(strict=True)
@@ -78,15 +78,16 @@ def resolved(path: Path) -> Path:
 def read_bytes(
     path: Path, most: int, judge: Callable[[os.stat_result], None] = lambda found: None
 ) -> bytes:
-    """Read a regular file's content.
+    """Return the content of a regular file.
 
     Args:
         path: the file, or a symbolic link to it.
         most: largest accepted size [bytes].
-        judge: looks at the file that was opened before it is read, and may raise.
+        judge: is called with the status of the opened file before it is read, and may raise an
+            error.
 
     Raises:
-        OutsideError: it cannot be read, is no regular file, or is larger.
+        OutsideError: the file cannot be read, is not a regular file, or is larger than `most`.
     """
     with _opened(path) as handle:
         judge(os.fstat(handle))
@@ -94,20 +95,20 @@ def read_bytes(
 
 
 def require(path: Path, most: int) -> None:
-    """Refuse a file that `read_bytes` would refuse, without reading it.
+    """Raise the error of `read_bytes` for a file that it would refuse, without reading the file.
 
     Raises:
-        OutsideError: see `read_bytes`.
+        OutsideError: the file cannot be read, is not a regular file, or is larger than `most`.
     """
     with _opened(path) as handle:
         _require_regular(os.fstat(handle), most)
 
 
 def text(content: bytes) -> str:
-    """Decode content as UTF-8.
+    """Decode UTF-8.
 
     Raises:
-        OutsideError: it is not UTF-8.
+        OutsideError: the content is not UTF-8.
     """
     try:
         return content.decode("utf-8")
@@ -119,11 +120,11 @@ def text(content: bytes) -> str:
 
 
 def xml_text(content: bytes) -> str:
-    """Decode an XML document, without a byte order mark.
+    """Decode an XML document, and drop a byte order mark.
 
     Raises:
-        OutsideError: it is not UTF-8, declares another encoding, or has a document type, whose
-            entities may unfold without end.
+        OutsideError: the content is not UTF-8, declares another encoding, or has a document type,
+            whose entities may expand without end.
     """
     document = text(content).removeprefix("\ufeff")
     declared = _DECLARED.match(document[:1000])
@@ -139,11 +140,11 @@ def xml_text(content: bytes) -> str:
 
 
 def json_value(content: bytes) -> Any:
-    """Parse a JSON document in which every number is finite and every text is printable as UTF-8.
+    """Parse a JSON document in which all numbers are finite and all texts can be written as UTF-8.
 
     Raises:
-        OutsideError: it is not JSON, nested too deeply, holds too many values, a number that is
-            not finite, or half a surrogate pair.
+        OutsideError: the content is not JSON, is nested too deeply, has too many values, or
+            contains a number that is not finite or half a surrogate pair.
     """
     count = sum(content.count(mark) for mark in (b",", b"[", b"{"))
     # Quotation marks within texts count as well, so there may be more of them.
@@ -165,10 +166,10 @@ def json_value(content: bytes) -> Any:
 
 
 def toml_tables(content: bytes) -> dict[str, Any]:
-    """Parse the tables of a TOML document.
+    """Parse a TOML document.
 
     Raises:
-        OutsideError: it is not TOML or nested too deeply.
+        OutsideError: the content is not TOML or is nested too deeply.
     """
     found = text(content)
     if found.startswith("\ufeff"):
@@ -196,7 +197,7 @@ _TOO_DEEP = f"nested too deeply; allowed is a depth of {MAX_NESTING}"
 
 
 def megabytes(size: float) -> str:
-    """Return a size in MiB as a text."""
+    """Return a size in bytes as text in MiB."""
     return f"{size / MEBIBYTE:.3g} MiB"
 
 
@@ -251,7 +252,7 @@ def _json_depth(document: str) -> int:
 
 
 def _depth(value: Any) -> int:
-    """Compute the depth of nested tables and arrays, without recursion."""
+    """Return the depth of nested tables and arrays, computed without recursion."""
     level, layer = 0, [value]
     while layer:
         level += 1
@@ -276,7 +277,8 @@ def _finite(digits: str) -> float:
 
 
 def _refuse_surrogates(value: Any) -> None:
-    """Refuse half surrogate pairs, which no file and no terminal can hold."""
+    """Raise an OutsideError if a text contains half a surrogate pair, which no file and no terminal
+    accepts."""
     left = [value]
     while left:
         one = left.pop()
@@ -308,10 +310,11 @@ def _one_line(error: Exception) -> str:
 
 
 def replace_file(path: Path, content: bytes, mode: int = 0o666) -> None:
-    """Replace a file durably: an interruption at any moment leaves the old content or the new one.
+    """Replace a file such that an interruption at any moment leaves either the old or the new
+    content.
 
-    The new content is written to `.NAME.draft` beside it first, under a lock: a second writer of
-    the same file waits. A draft of a killed process is overwritten.
+    The new content is first written to `.NAME.draft` beside the file, under a lock, so that a
+    second writer of the same file waits. A draft that a killed process left is overwritten.
 
     Args:
         path: the file, in an existing folder.
@@ -319,7 +322,7 @@ def replace_file(path: Path, content: bytes, mode: int = 0o666) -> None:
         mode: permissions of the file, as far as the process's mask allows them.
 
     Raises:
-        OSError: it cannot be written; the draft is removed.
+        OSError: the file cannot be written; the draft is removed.
     """
     draft = path.with_name(f".{path.name}.draft")
     with _alone(draft, mode) as file:
@@ -336,10 +339,10 @@ def replace_file(path: Path, content: bytes, mode: int = 0o666) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Make a folder's entries durable.
+    """Write the entries of a folder to the disk, so that a power failure does not lose them.
 
     Raises:
-        OSError: there is none, or the disk does not take them.
+        OSError: the folder does not exist, or the disk cannot be written.
     """
     handle = os.open(folder, os.O_RDONLY)
     try:
@@ -350,7 +353,8 @@ def sync_folder(folder: Path) -> None:
 
 @contextmanager
 def _alone(draft: Path, mode: int) -> Iterator[BinaryIO]:
-    """Open a new, empty file with an exclusive lock, as far as the file system has locks."""
+    """Open a new, empty file and hold an exclusive lock on it, if the file system supports
+    locks."""
     while True:
         with open(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW, mode), "wb") as file:
             with suppress(OSError):
@@ -362,8 +366,8 @@ def _alone(draft: Path, mode: int) -> Iterator[BinaryIO]:
 
 
 def _is_still(draft: Path, file: BinaryIO) -> bool:
-    """Return True if the path still is the locked file; a former owner of the lock may have
-    renamed it."""
+    """Return True if the path still refers to the open file. A former owner of the lock may have
+    renamed the file."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), draft.stat(follow_symlinks=False))
     except FileNotFoundError:
@@ -371,5 +375,5 @@ def _is_still(draft: Path, file: BinaryIO) -> bool:
 
 
 def printable(text: str) -> str:
-    """Return a foreign text in one line of printable characters."""
+    """Return a text of unknown origin in one line of printable characters."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())

@@ -22,16 +22,16 @@ from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation
 
 TRIALS = 40
-"""Places that are tried; those that come out equal count each time."""
+"""Default number of places that are tried; equal places count each time."""
 
 UPRIGHT_FACE = 0.9
-"""Least part of the world's z that lies in an upright face."""
+"""Least length of the projection of the world's z axis onto a face that counts as upright."""
 
 WORST = 1e9
-"""Cost of what cannot be driven [N s]."""
+"""Cost of a place with which the path cannot be driven [N s]."""
 
 Range = tuple[float, float]
-"""Least and largest [m]."""
+"""Lower and upper bound [m]."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,8 @@ class Grip:
 def propose_grip(
     cell: Cell, up: Range, along: Range, trials: int = TRIALS, *, progress: ShowProgress = False
 ) -> Grip:
-    """Find the best place of the pads for the cell's hand-made path, and certify the path with it.
+    """Find the place of the pads at which the cell's hand-made path has the least product of
+    duration and force, and certify the path with this place.
 
     Args:
         cell: cell with pads on upright faces, and forces in closed form.
@@ -75,11 +76,12 @@ def propose_grip(
         along: range of the level shift along the faces [m]; positive is to the left of the first
             robot's pad, seen from the robot.
         trials: number of places to try.
-        progress: True for a progress bar, or a function of the numbers of done and of all places.
+        progress: True for a progress bar, or a function that is called with the number of places
+            tried and their total.
 
     Raises:
-        SettingsError: a range is empty or none, the pads are others, or nothing within the ranges
-            lets the path be driven.
+        SettingsError: both ranges are empty or a range is reversed, the cell's pads are not
+            supported, or the path cannot be driven with any place in the ranges.
     """
     for low, high in (up, along):
         if not -1.0 <= low <= high <= 1.0:
@@ -143,7 +145,8 @@ def _ways(workcell: Workcell) -> Array:
 
 
 def _changes(workcell: Workcell, ways: Array, at: tuple[float, float]) -> dict[str, Any]:
-    """Return changes by key path, see `Cell.changed`."""
+    """Return the changes of the workcell file that put the pads at a place, by key path as for
+    `Cell.changed`."""
     if at == (0.0, 0.0):
         return {}
     shift = np.asarray(at) @ ways
@@ -154,8 +157,8 @@ def _changes(workcell: Workcell, ways: Array, at: tuple[float, float]) -> dict[s
 
 
 def _cost(drivable: Cell, changes: dict[str, Any]) -> tuple[float, float, float]:
-    """Compute the least product of duration and commanded force [N s], and both; infinite for
-    none."""
+    """Return the least product of duration and commanded force [N s], the duration [s] and the
+    force [N] of the changed cell's path; all infinite if it cannot be driven."""
     none = np.inf, np.inf, np.inf
     try:
         cell = drivable.changed(changes) if changes else drivable

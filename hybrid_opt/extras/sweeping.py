@@ -94,16 +94,17 @@ def read_sweep(file: Path) -> Sweep:
     """Read a stored sweep.
 
     Raises:
-        ResultsError: it cannot be read or is damaged.
+        ResultsError: the file cannot be read or is damaged.
     """
     return read_record(Sweep, file, _OTHER_FILE)
 
 
 def require_keys(cell: Cell, over: Mapping[str, Sequence[float]]) -> None:
-    """Refuse a sweep over keys that a cell does not have, before any work.
+    """Check before any work that a cell has the keys of a sweep.
 
     Raises:
-        SettingsError, WorkcellError: as of `sweep`.
+        SettingsError: there are no values.
+        WorkcellError: a key does not exist.
     """
     if not over or not all(map(len, over.values())):
         raise SettingsError("a sweep needs keys, and values of each", code="no-values")
@@ -172,13 +173,14 @@ def sweep(
 
 
 class _Chains:
-    """Chains of combinations that differ in the last key alone, each with its finished rows.
+    """The combinations of a sweep, arranged in chains in which only the last key varies, with the
+    finished results.
 
     Attributes:
-        sweep: its rows are the finished ones, in the order of the sweep.
-        size: combinations in all.
+        sweep: the sweep with the finished results, in the order of the sweep.
+        size: number of all combinations.
         columns: values of the last key.
-        done: rows by their values.
+        done: finished results by the values of their combinations.
     """
 
     def __init__(self, known: Sweep, file: Path | None) -> None:
@@ -190,12 +192,13 @@ class _Chains:
         self._write()
 
     def left(self, column: float) -> list[tuple[float, ...]]:
-        """Return the combinations with this value of the last key that are not done."""
+        """Return the combinations with this value of the last key that are not finished."""
         every = [(*head, column) for head in self._heads]
         return [values for values in every if values not in self.done]
 
     def near(self, values: tuple[float, ...]) -> Array | None:
-        """Return the carry of the nearest earlier combination of a chain that has one."""
+        """Return the decision vector of the nearest finished combination before this one in its
+        chain that has a carry, None if there is none."""
         *head, last = values
         for value in reversed(self.columns[: self.columns.index(last)]):
             if len(x := self.done[*head, value].x):
@@ -203,7 +206,7 @@ class _Chains:
         return None
 
     def store(self, row: Combination) -> None:
-        """Add a row, and write the file."""
+        """Add the result of a combination, and write the file of the sweep."""
         self.done[row.values] = row
         self._write()
 
@@ -217,13 +220,13 @@ class _Chains:
 
 @dataclass(frozen=True)
 class _Request:
-    """The common data of all combinations of a sweep; each process loads the cell once.
+    """Data that all combinations of a sweep share.
 
     Attributes:
         cell: the unchanged cell.
-        x: (n_var,) a good carry of it.
-        fixed: the path is kept.
-        keys: of the combinations.
+        x: (n_var,) decision vector of a good carry of the unchanged cell.
+        fixed: True if the path is kept.
+        keys: keys of the changed numbers.
     """
 
     cell: Cell
@@ -233,11 +236,12 @@ class _Request:
 
 
 _LOADED: dict[tuple[Any, ...], Cell] = {}
-"""The cell of the last sweep of this process."""
+"""The cell of the last sweep of this process, by its digest and objectives."""
 
 
 def _loaded(cell: Cell) -> Cell:
-    """Return the given cell as loaded before in this process."""
+    """Return the cell kept from an earlier call in this process if it equals the given one, else
+    the given cell."""
     key = cell.workcell.digest, *cell.objectives
     if key not in _LOADED:
         _LOADED.clear()
@@ -248,7 +252,8 @@ def _loaded(cell: Cell) -> Cell:
 def _next_row(
     request: _Request, combination: tuple[tuple[float, ...], Array | None]
 ) -> Combination:
-    """Compute a row from the one before it that has a carry."""
+    """Compute the result of a combination. `combination` holds the values and the decision vector
+    of the nearest combination with a carry, or None."""
     numbers, near = combination
     known = [request.x] if near is None or request.fixed else [request.x, near]
     values = dict(zip(request.keys, numbers, strict=True))
@@ -276,7 +281,7 @@ def _row(
 
 
 def _tried(cell: Cell, near: Sequence[Array], fixed: bool) -> Evaluations:
-    """Evaluate paths, and the hand-made one unless the path is fixed, each within its best force
+    """Evaluate paths, and the hand-made path unless the path is fixed, each with its best force
     limit."""
     x = np.array([x[:-1] for x in (near if fixed else [*near, cell.initial])])
     paths = DrivenPaths(cell, x)

@@ -33,13 +33,14 @@ from symbolic.records import POSE_SIZE, Workcell
 from symbolic.records.poses import box_placement, inverse, rpy_from_rotation, transform
 
 SEARCH_EVALUATIONS = 400
-"""Candidates of a search around the carry at hand: 1.6 s on the rack."""
+"""Number of candidates of a search around the present carry, which takes 1.6 s for the rack."""
 
 SEARCH_WIDTH = 0.05
-"""Standard deviation of its first generation around that carry, over the bounds' width."""
+"""Standard deviation of the search's first generation around the present carry, as a share of the
+width of the bounds."""
 
 FIRST = 39
-"""Carries of that generation that are near; with the one at hand a whole population."""
+"""Number of random candidates in that generation; with the present carry it is one population."""
 
 
 @dataclass(frozen=True)
@@ -94,10 +95,12 @@ class Session:
     """
 
     def __init__(self, cell: Cell, x: Array | None = None) -> None:
-        """Look at a carry.
+        """Open a session and evaluate its first carry.
 
         Args:
-            x: its decision vector in `cell.drivable()`; None for the hand-made carry.
+            cell: the cell.
+            x: (n_var,) decision vector of a carry of `cell.drivable()`; None for the hand-made
+                carry.
 
         Raises:
             DualArmError: the cell has no drivable form, or x does not fit.
@@ -110,7 +113,7 @@ class Session:
 
     @property
     def cell(self) -> Cell:
-        """The changed cell as a drivable one."""
+        """The changed cell in its drivable form."""
         return self.verdict.cell or self._drivable
 
     def change(self, changes: Mapping[str, Any]) -> SessionVerdict:
@@ -143,7 +146,13 @@ class Session:
     def optimise(
         self, rng: np.random.Generator, evaluations: int = SEARCH_EVALUATIONS
     ) -> SessionVerdict:
-        """Search around the present carry for the least product of duration and force."""
+        """Search around the present carry for one with a smaller product of duration and force, and
+        make it the present carry.
+
+        Args:
+            rng: random generator of the search.
+            evaluations: number of candidates.
+        """
         task, cell = self.cell.workcell.task, self.cell
         width = np.where(np.isfinite(task.upper - task.lower), task.upper - task.lower, 0.0)
         near = self.x + SEARCH_WIDTH * width * rng.standard_normal((FIRST, task.n_var))
@@ -159,8 +168,8 @@ class Session:
         return self.verdict
 
     def save(self, folder: str | Path) -> Path:
-        """Write the changed cell, with the present path as its hand-made one, and every file that
-        it needs into a folder of its own; return the workcell file.
+        """Write the changed cell into a folder of its own, with the present path as its hand-made
+        one and all files that it needs. Return the path of the workcell file.
 
         Raises:
             DualArmError: the folder is not empty, or cannot be written.
@@ -177,10 +186,15 @@ class Session:
         return unpack_cell(collect_cell(cell.workcell), folder).source
 
     def export(self, target: str, folder: str | Path) -> tuple[Path, ...]:
-        """Write the whole job around the carry for robots, and the carry itself as carry.json.
+        """Write the whole job around the carry as a bundle for robots, and the carry itself as
+        carry.json. Return the paths of the files.
+
+        Args:
+            target: name of the export's target.
+            folder: folder of the bundle.
 
         Raises:
-            DualArmError: see `hybrid_opt.export`; the carry is not feasible.
+            DualArmError: the carry is not feasible, or the target does not support it.
         """
         carry = self.verdict.carry
         if carry is None or not self.verdict.feasible:
@@ -215,8 +229,8 @@ class Session:
 
 
 def handles(workcell: Workcell) -> tuple[Handle, ...]:
-    """Return the parts of a cell that may be dragged: start, goal, bodies around, bases and
-    pads."""
+    """Return the parts of a cell that can be dragged: start, goal, bodies of the environment, bases
+    and pads."""
     task, bodies = workcell.task, workcell.environment
     first, last = (
         box_placement(task.orientation, task.waypoints[k].lower[:POSE_SIZE]) for k in (0, -1)
@@ -237,7 +251,8 @@ def handles(workcell: Workcell) -> tuple[Handle, ...]:
 
 
 def moved(workcell: Workcell, handle: Handle, pose: Array) -> dict[str, Any]:
-    """Return the changes, by key path, that move a handle to another pose (4, 4) of the world."""
+    """Return the changes of the workcell file, by key path, that move a draggable part to another
+    pose (4, 4) in the world."""
     xyz = [round(value, 6) for value in pose[:3, 3].tolist()]
     rpy = [round(value, 6) for value in rpy_from_rotation(pose[:3, :3]).tolist()]
     section = handle.key.partition(".")[0].partition("[")[0]
@@ -276,24 +291,26 @@ FRAME = 0.04
 
 
 class Workbench:
-    """A cell in a browser, served on this machine alone.
+    """A cell that is changed in a browser page, served to this machine alone.
 
-    One thread works. It always takes the latest request, so that dragging never queues.
+    One thread does all work. It always takes the latest request, so that dragging never makes
+    requests queue.
 
     Attributes:
-        session: the shown session.
-        url: of the page.
+        session: the session that the page shows.
+        url: address of the page.
     """
 
     def __init__(self, session: Session, port: int = 8080, seed: int = 1) -> None:
-        """Serve it.
+        """Start to serve a session.
 
         Args:
-            port: where to listen; another free one is taken if it is in use.
-            seed: of searches.
+            session: the session.
+            port: port of the page; another free one is taken if it is in use.
+            seed: of the random numbers of searches.
 
         Raises:
-            DisplayError: viser is missing.
+            DisplayError: the package viser is not installed.
         """
         try:
             import viser
@@ -318,7 +335,8 @@ class Workbench:
         self._thread.start()
 
     def ask(self, changes: dict[str, Any]) -> None:
-        """Request an evaluation of changes by key; the last waiting value of a key counts."""
+        """Request the evaluation of changes by key; of several waiting values of a key only the
+        last counts."""
         with self._news:
             self._changes |= changes
             self._news.notify()
@@ -392,7 +410,7 @@ class Workbench:
         )
 
     def _look(self) -> None:
-        """Set the camera to see the whole motion from the front, above."""
+        """Place the camera in front and above such that the whole motion is visible."""
         carry = self.session.verdict.carry
         assert carry is not None, "a session begins with a carry"
         points = motion_points(self._geometry, carry.pose, carry.q)
@@ -405,7 +423,7 @@ class Workbench:
         field.on_update(lambda _: self.ask({key: field.value}))
 
     def _grasp(self, handle: Handle | None) -> None:
-        """Show the arrows of one handle, or of none."""
+        """Show the arrows for dragging at one part, or at none."""
         if self._gizmo is not None:
             self._gizmo.remove()
             self._gizmo = None
@@ -480,7 +498,7 @@ class Workbench:
         self._pose()
 
     def _draw(self, verdict: SessionVerdict) -> None:
-        """Draw meshes of bodies that are new, or changed their shape or pose."""
+        """Redraw the meshes of bodies that are new, or changed in shape or pose."""
         assert verdict.cell is not None
         self._geometry = verdict.cell.geometry
         scene = self._server.scene
@@ -499,7 +517,7 @@ class Workbench:
             self._solids[solid.name] = (solid, mesh)
 
     def _pose(self) -> None:
-        """Draw everything that moves at the selected sample."""
+        """Place all moving bodies as at the selected sample."""
         carry = self.session.verdict.carry
         if carry is None:
             return

@@ -17,7 +17,8 @@ from symbolic.safe_io import replace_file, sync_folder
 MANIFEST = "manifest.json"
 
 MEASURED_FILE = "measured.toml"
-"""What a bundle's own bring-up writes beside it; it goes with the bundle."""
+"""Name of the file that the bundle's bring-up program writes into the bundle; it is kept when the
+bundle is replaced."""
 
 BUNDLE_FORMAT = "dual-arm-carry bundle"
 BUNDLE_VERSION = 2
@@ -88,10 +89,10 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def _require_own(folder: Path) -> None:
-    """Refuse to replace a folder that is not a bundle as it was written.
+    """Check that a folder which is to be replaced is a bundle as it was written.
 
     Raises:
-        ResultsError: with the first file that is someone else's.
+        ResultsError: the folder holds another file; the message names the first one.
     """
     if not os.path.lexists(folder):
         return

@@ -157,8 +157,8 @@ def write_trajectory(
 
 
 def _standing_still(workcell: Workcell) -> tuple[Array, ...]:
-    """Return the inputs of a candidate besides x: in drivable cells a timing at rest, on which
-    the start postures do not depend."""
+    """Return the inputs of the candidate function besides x; for drivable cells the timing of a
+    carry at rest, because the start postures do not depend on the timing."""
     if not workcell.task.law.is_drivable:
         return ()
     still = np.zeros(workcell.task.samples)
@@ -195,7 +195,8 @@ class _Content:
     cell: Any
 
     def __post_init__(self) -> None:
-        """Refuse more numbers and larger ones than any cell has, and unprintable names."""
+        """Raise a ValueError for more or larger numbers than any cell has, and for names that are
+        not printable."""
         vectors = {"decision": self.decision, "start[0]": self.start[0], "start[1]": self.start[1]}
         for name, values in (vectors | {"figures": tuple(self.figures.values())}).items():
             if len(values) > MOST_NUMBERS:

@@ -111,7 +111,8 @@ def closing_squeeze(workcell: Workcell) -> InternalForce | None:
 
 
 def has_force_closure(workcell: Workcell) -> bool:
-    """Return True if a workcell's pads can hold the payload under every motion."""
+    """Return True if a workcell's pads can hold the payload under every motion, if they press
+    strongly enough."""
     return _balanced_states(workcell, SPARE_FRICTION) is not None
 
 
@@ -135,13 +136,14 @@ def equal_pressure_rows(workcell: Workcell) -> Array:
 
 
 def balance_maps(workcell: Workcell, in_units: bool = False) -> list[Array]:
-    """Return for each pad the matrix (6 + k, 4) from its state to the balanced quantities: force
-    and moment about the box frame's origin, along the box's axes, then the k rows of
+    """Return for each pad the matrix (6 + k, 4) that maps its state to its contribution to the
+    balance: force and moment about the box frame's origin along the box's axes, then the k rows of
     `equal_pressure_rows`.
 
     Args:
         workcell: the workcell.
-        in_units: True for states in newtons and newton metres, not scaled by friction and radius.
+        in_units: True for states in newtons and newton metres instead of states scaled by friction
+            and radius.
     """
     alike, found = equal_pressure_rows(workcell), []
     for i, pad in enumerate(workcell.pads):

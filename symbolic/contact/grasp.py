@@ -110,13 +110,13 @@ class Grasp:
         return ca.vertcat(*wrenches)[self._free.tolist()]
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
-        """Compute all wrenches that balance the load among the inputs, from their free
-        components."""
+        """Compute the wrenches of all pads that balance a load, from the free components. The load
+        is the first of the inputs `cell`."""
         load, *sizes = cell
         return self._balanced_wrenches(load, free, sizes)
 
     def _balanced_wrenches(self, load: ca.SX, free: ca.SX, sizes: list[ca.SX]) -> list[ca.SX]:
-        """Compute all wrenches that balance a load from their free components."""
+        """Compute the wrenches of all pads that balance a load (6,), from their free components."""
         units = ca.vertcat(*[self.units(i, *sizes) for i in range(len(self.patches))])
         given = ca.mtimes(number(self.numbers.free_to_left), units[self._free.tolist()] * free)
         left = ca.mtimes(number(self.numbers.load_to_left), load) - given
@@ -183,7 +183,7 @@ class Grasp:
         return replace(self.numbers, rest=rest, rest_slopes=slopes)
 
     def _nominal(self) -> tuple[list[float], ...]:
-        """Return the cell's own values of the inputs that follow the load."""
+        """Return the values that the workcell states for the inputs after the load."""
         return (np.array(ca.evalf(self.friction)).ravel().tolist(),)
 
     def least_states(self, load: ca.SX, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
@@ -202,8 +202,8 @@ class Grasp:
         return self._at(ca.SX(number(self.numbers.squeeze)), friction, reach)
 
     def squeeze_normals(self) -> Array:
-        """Compute the normal force (2,) of each robot in the squeeze, for a grasp without symbolic
-        parameters."""
+        """Compute the normal forces (2,) of the robots in the initial squeeze of unit size. The
+        grasp must have no symbolic parameters."""
         return np.array(ca.evalf(self.normals)).ravel()
 
     @property
@@ -215,8 +215,8 @@ class Grasp:
         return found
 
     def squeeze_wrenches(self) -> Array:
-        """Compute the wrenches (k, 6) of all pads in the squeeze, along the pads' axes, for a grasp
-        without symbolic parameters."""
+        """Compute the wrenches (k, 6) of all k pads in the initial squeeze of unit size, along the
+        pads' axes. The grasp must have no symbolic parameters."""
         states = ca.vertsplit(ca.SX(number(self.numbers.squeeze)), self._ends)
         parts = [
             full_wrench(self.units(i, self.friction) * state) for i, state in enumerate(states)
@@ -264,7 +264,7 @@ class Grasp:
         return ca.vertcat(*whole), ca.repmat(beyond, len(wrenches), 1)
 
     def units(self, i: int, friction: ca.SX, reach: ca.SX = WHOLE) -> ca.SX:
-        """Return the units (m,) of the entries of pad i's scaled wrench: factors to newtons and
+        """Return the factors (m,) that convert the entries of pad i's scaled wrench to newtons and
         newton metres."""
         robot = self.robots[i]
         radius = self.numbers.reach * self._pads[i].patch_radius
@@ -272,8 +272,8 @@ class Grasp:
         return ca.vertcat(1.0, mu, mu, mu * (reach[robot] * radius))
 
     def _at(self, states: ca.SX, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
-        """Convert states (n,) at the nominal friction and sizes to states of the same forces at
-        other friction and sizes."""
+        """Convert states (n,) of all pads, which are scaled by the nominal friction and patch
+        sizes, to states of the same forces scaled by other friction and sizes."""
         moved, owns = [], ca.vertsplit(states, self._ends)
         for pad, robot, state in zip(self._pads, self.robots, owns, strict=True):
             by_friction, by_reach = pad.friction / friction[robot], 1.0 / reach[robot]

@@ -60,7 +60,7 @@ class GraspSqueeze(Grasp):
         self.cell_sizes = (*self.cell_sizes, ("reach", 2), ("displacement", 4))
 
     def _nominal(self) -> tuple[list[float], ...]:
-        """Return the cell's own values of the inputs that follow the load."""
+        """Return the values that the workcell states for the inputs after the load."""
         return (*super()._nominal(), [1.0, 1.0], [0.0] * 4)
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:

@@ -89,7 +89,14 @@ def direction(place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
 
 
 def gap(place: PathPointSymbols, obstacle: ca.SX, numbers: ca.SX) -> ca.SX:
-    """Return the gap between payload and obstacle along a direction [m], with rounded kinks."""
+    """Return the gap [m] between payload and obstacle along one separating direction, with rounded
+    kinks.
+
+    Args:
+        place: symbols of the place of the path.
+        obstacle: (BOX_NUMBERS,) parameters of the obstacle, a box.
+        numbers: (DIRECTION_NUMBERS,) coefficients of the direction.
+    """
     n = direction(place, numbers)
     return place.scene.separation(obstacle, n / ca.norm_2(n))
 

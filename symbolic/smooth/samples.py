@@ -276,7 +276,8 @@ def _force_function(workcell: Workcell) -> ca.Function:
 
 
 def _contact_load(workcell: Workcell, wrench: ca.SX) -> ContactLoad:
-    """Return the contact load that corresponds to a force and moment (6,) in the box frame."""
+    """Return the record of a contact load for a force and moment (6,) about the centre of mass, in
+    the box frame [N, N m]."""
     contacts, centre = workcell.contacts, workcell.payload.centre_of_mass
     first, second = (ca.SX(number(c.T_box_pad[:3, 3] - centre)) for c in contacts)
     axes = ca.SX(number(contacts[0].T_box_pad[:3, :3]))

@@ -39,14 +39,14 @@ WIDTHS = np.array([1e3, *[1e2] * 3, *[0.3] * 4, *NOISE, *NOISE])
 of both arms' offsets."""
 
 SOUGHT = 8
-"""Unknowns in front of the offsets."""
+"""Number of unknowns before the offsets: mass, mass times centre, and crosstalk."""
 
 WEIGHED = 0.01
-"""Standard deviation of a scale [kg]."""
+"""Standard deviation of the mass from a scale [kg]."""
 
 SEEN_MASS, SEEN_CENTRE, SEEN_CROSSTALK = 0.05, 0.005, 0.02
-"""Standard deviations up to which the mass (a share), the centre of mass [m] and crosstalk count
-as seen."""
+"""Largest standard deviations with which the mass (as a share), the centre of mass [m] and the
+crosstalk count as determined."""
 
 
 # --- mass, centre of mass, crosstalk ---
@@ -150,8 +150,8 @@ def fit_load(holds: Sequence[MeasuredHold], moments: bool = True) -> Load:
 
 
 def _balance(hold: MeasuredHold) -> tuple[Array, Array, Array]:
-    """Compute (1) and (2) of a hold: matrix (6, unknowns), right side (6,), covariance of that
-    (6, 6)."""
+    """Return Eqs. (1) and (2) of a hold as a linear system: matrix (6, unknowns), right side (6,),
+    and the covariance (6, 6) of the right side."""
     matrix, value, noise = np.zeros((6, len(WIDTHS))), np.zeros(6), np.zeros((6, 6))
     matrix[:3, 0] = hold.gravity
     matrix[3:, 1:4] = -skew(hold.gravity)
@@ -181,32 +181,33 @@ GRID_STEP = 0.005
 """Step of the grid on which signals are compared [s]."""
 
 LARGEST_GRID = 2_000_000
-"""Points of it; a longer recording has no delay."""
+"""Largest number of points of that grid; no delay is computed for longer recordings."""
 
 SMOOTHED = 0.05
-"""Time over which rates are taken [s]."""
+"""Time over which the rates of signals are averaged [s]."""
 
 LEAST_LIKENESS = 0.5
-"""Correlation of two signals' rates from which on one is the other, later."""
+"""Least correlation of two signals' rates with which one counts as the delayed other."""
 
 CLEARER = 1.05
-"""Least ratio of what is unlike without the delay to what is unlike with it. Noise alone reaches
-1.04."""
+"""Least ratio of the difference of two signals without the delay to the difference with it. Noise
+alone reaches 1.04."""
 
 
 def delay(
     time: Array, first: Array, second: Array, most: float = 1.0, apart: float | None = None
 ) -> float | None:
-    """Estimate the delay of the second signal (n,) behind the first (n,) [s]; negative if it is
-    earlier.
+    """Estimate by how much the second signal lags behind the first [s]; negative if it is ahead.
 
     Args:
-        time: (n,) [s].
+        time: (n,) times of the samples [s].
+        first, second: (n,) signals.
         most: largest delay that is considered [s].
         apart: a delay that is excluded [s], None for none.
 
     Returns:
-        The delay of the largest correlation of both rates; None for a weak correlation.
+        The delay with the largest correlation of both signals' rates; None if that correlation is
+        weak.
     """
     wide = round(SMOOTHED / GRID_STEP)
     if not 4 * wide < (time[-1] - time[0]) / GRID_STEP < LARGEST_GRID:
@@ -247,10 +248,11 @@ LARGEST_RATIO = 20.0
 
 
 class FrictionRatio:
-    """Coefficient of both pads at which a measured wrench is just held.
+    """Function of a measured wrench: the friction coefficient of both pads with which the wrench
+    would just be held by evenly pressing pads.
 
     Args:
-        workcell: whose patches press, evenly.
+        workcell: cell with the contact patches.
     """
 
     def __init__(self, workcell: Workcell) -> None:
@@ -263,11 +265,11 @@ class FrictionRatio:
             self._capacity.append(ca.Function("capacity", [grip, tangent], [carried]))
 
     def __call__(self, wrench: Array) -> float:
-        """Compute the ratio of readings (2, 6) about the pads, along their axes, free of offset and
-        crosstalk.
+        """Compute the friction coefficient that just holds the wrenches (2, 6) measured about both
+        pads, along the pads' axes, without offset and crosstalk [N, N m].
 
         Returns:
-            the ratio; infinite where a pad does not press.
+            The coefficient; infinite if a pad does not press.
         """
         normal, tangent = -wrench[:, 2], wrench[:, :2]
         # Both moments act about the same line, their normals being opposite.

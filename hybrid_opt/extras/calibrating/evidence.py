@@ -40,25 +40,27 @@ from symbolic.records.poses import inverse
 from symbolic.records.quantities import GRAVITY
 
 PIECE, SHORTEST = 2.0, 0.5
-"""Least length of the pieces into which holds are cut [s]."""
+"""Usual length of the pieces into which holds are cut, and least length of a piece that is used
+[s]."""
 
 STILL_MOTION = 0.01
-"""Most that a joint moves in a piece of a hold that counts as still [rad or m]."""
+"""Largest motion of a joint in a piece that counts as still [rad or m]."""
 
 RATIO_TIME = 0.2
-"""Time over which forces are averaged for a ratio of friction [s]."""
+"""Time over which forces are averaged before the friction ratio is computed [s]."""
 
 LEAST_PATH = 0.02
-"""Way of the box from which on one arm's delay after the other can be seen [m]."""
+"""Least distance that the box has to move before the delay between the arms is computed [m]."""
 
 SURE = 3.0
-"""Standard deviations that a range covers."""
+"""Half the width of the ranges that are written, in standard deviations."""
 
 LEAST_MASS, LEAST_CENTRE, LEAST_FRICTION = 0.005, 0.001, 0.10
-"""Least ranges that are written: shares, and [m]. Slips of one pair of surfaces spread by 10 %."""
+"""Least ranges of mass (share), centre of mass [m] and friction (share) that are written. Slips
+between the same two surfaces scatter by 10 %."""
 
 SAME_BOX = 0.03
-"""Weighed masses of one box differ by less, as a share."""
+"""Largest relative difference of the weighed masses of runs with one box."""
 
 
 @dataclass(frozen=True)
@@ -66,8 +68,9 @@ class EvidenceEntry:
     """One quantity that the runs determine.
 
     Attributes:
-        name, found: for messages.
-        key: key of the workcell file with its present value, '' without one.
+        name: of the quantity, for messages.
+        found: the result as text.
+        key: key in the workcell file that gets the value, '' for none.
     """
 
     name: str
@@ -77,16 +80,16 @@ class EvidenceEntry:
 
 @dataclass
 class Evidence:
-    """Evidence from runs of a cell, collected step by step.
+    """Results of a calibration from recorded runs, collected step by step.
 
     Attributes:
         workcell: the cell.
         runs: names of the recordings.
-        entries: the results.
+        entries: the determined quantities.
         faults: faults of the runs.
-        asks: recordings that would determine the missing quantities.
-        tables: changed tables of the workcell file: keys, or one mapping per contact.
-        ranges: of `[uncertainty]`.
+        asks: descriptions of further recordings that would determine the missing quantities.
+        tables: changed tables of the workcell file: new values by key, or one mapping per contact.
+        ranges: changed entries of the table `[uncertainty]`.
     """
 
     workcell: Workcell
@@ -98,17 +101,17 @@ class Evidence:
     ranges: dict[str, Any] = field(default_factory=dict)
 
     def tell(self, name: str, found: str, key: str = "") -> None:
-        """Add a quantity."""
+        """Add a determined quantity with its result as text."""
         self.entries.append(EvidenceEntry(name, found, key))
 
     def set_uncertainty(self, name: str, value: Any) -> None:
-        """Set a range of `[uncertainty]`, rounded up."""
+        """Set an entry of the table `[uncertainty]`, rounded up to four decimals."""
         up = np.ceil(np.maximum(1e4 * np.asarray(value, dtype=float) - 1e-6, 0.0)) / 1e4
         self.ranges[name] = up.tolist()
 
     @property
     def changes(self) -> dict[str, Any]:
-        """Changes of the workcell file."""
+        """All changed tables of the workcell file."""
         if not self.ranges:
             return self.tables
         # A stated table takes what it does not name for exact.
@@ -126,7 +129,7 @@ class Evidence:
 
     @property
     def document(self) -> dict[str, Any]:
-        """The same as JSON values."""
+        """The runs, results, faults, requests and changes as JSON values."""
         return {
             "runs": list(self.runs),
             "entries": [vars(entry) for entry in self.entries],
@@ -137,10 +140,10 @@ class Evidence:
 
 
 def calibrate(workcell: Workcell, runs: Sequence[Recording]) -> Evidence:
-    """Collect the evidence of runs about a cell.
+    """Determine sensors, payload, friction and force tracking of a cell from recorded runs.
 
     Raises:
-        SettingsError: runs of different boxes.
+        SettingsError: the runs have boxes of different weight.
     """
     masses = [run.labels.mass for run in runs if run.labels.mass is not None]
     if masses and max(masses) > (1.0 + SAME_BOX) * min(masses):
@@ -201,7 +204,14 @@ def _pieces(run: Recording, places: Places) -> list[MeasuredHold]:
 
 
 def _empty(run: Recording, pieces: list[MeasuredHold], evidence: Evidence) -> None:
-    """Compare the sensors with zero, in the postures of an empty run."""
+    """Add the largest force that the sensors show in a run without a box, and a fault if it is too
+    large.
+
+    Args:
+        run: the run.
+        pieces: still pieces of the run.
+        evidence: gets the result.
+    """
     if not pieces:
         return
     most = max(float(np.linalg.norm(piece.wrench[:, :3], axis=1).max()) for piece in pieces)
@@ -213,11 +223,12 @@ def _empty(run: Recording, pieces: list[MeasuredHold], evidence: Evidence) -> No
 
 
 Sound = list[tuple[Recording, Places]]
-"""Runs without serious faults, their readings without offsets."""
+"""Runs without serious faults, each with its pad poses and its wrenches without offsets."""
 
 
 def _load(sound: Sound, evidence: Evidence) -> Load | None:
-    """Estimate mass, centre of mass and crosstalk, as far as the runs show them."""
+    """Estimate mass, centre of mass and crosstalk as far as the runs determine them, and add the
+    results to the evidence. None if there are no holds, or the holds have faults."""
     holds, moments = [], True
     for run, places in sound:
         found = _pieces(run, places)
@@ -283,7 +294,8 @@ def _load(sound: Sound, evidence: Evidence) -> Load | None:
 
 
 def _friction(sound: Sound, load: Load | None, evidence: Evidence) -> None:
-    """Bracket the friction: greatest ratio that held, least that slipped."""
+    """Bracket the friction coefficient between the greatest ratio that held and the least that
+    slipped, and add both to the evidence."""
     if (
         load is None
         or not load.observable_crosstalk.all()
@@ -328,7 +340,8 @@ def _friction(sound: Sound, load: Load | None, evidence: Evidence) -> None:
 
 
 def _tracking(sound: Sound, evidence: Evidence) -> None:
-    """Compute quantiles of the force over the commanded one, and its lag."""
+    """Add to the evidence quantiles of the measured over the commanded force, and the delay of the
+    force."""
     worst: list[float] = []
     for i in range(2):
         shares, lags = [], []
@@ -356,7 +369,8 @@ def _tracking(sound: Sound, evidence: Evidence) -> None:
 
 
 def _drift(sound: Sound, evidence: Evidence) -> None:
-    """Measure the relative motion of the pads while they hold, and the delay between the arms."""
+    """Add to the evidence the relative motion of the pads during holds, and the delay between the
+    arms."""
     beside: list[Array] = []
     turned: list[Array] = []
     delays = []
@@ -397,16 +411,17 @@ def _drift(sound: Sound, evidence: Evidence) -> None:
 
 
 def calibrated_file(source: Path, evidence: Evidence, output: Path) -> str:
-    """Write the text of a workcell file with calibrated values, comments kept, evidence as
-    comments.
+    """Return the text of a workcell file with calibrated values. Comments are kept, and the results
+    are added as comments.
 
     Args:
         source: the workcell file.
-        output: where it will be; paths are then relative to its folder.
+        evidence: the results.
+        output: path at which the text will be stored; paths in it are relative to its folder.
 
     Raises:
-        WorkcellError: the calibrated cell would not be a valid one.
-        SettingsError: the file is written in a way that cannot be completed.
+        WorkcellError: the calibrated cell would not be valid.
+        SettingsError: the file is written in a form that cannot be changed.
     """
     try:
         text = safe_io.text(safe_io.read_bytes(source, safe_io.WORKCELL_BYTES))

@@ -14,44 +14,45 @@ from symbolic.records.poses import inverse
 from symbolic.records.quantities import GRAVITY, STANDARD_GRAVITY
 
 LARGEST_RESIDUAL = 0.1
-"""Force that the fit of a load may leave, over the weight."""
+"""Largest residual force of the fit of a load, as a share of the weight."""
 
 FULL = 0.98
-"""Share of a sensor's range from which on it may not show all."""
+"""Share of a sensor's range above which the sensor may be saturated."""
 
 VANISHED = 0.1
-"""Share of a hold's usual squeeze below which it has vanished."""
+"""Share of a hold's usual squeeze below which the squeeze counts as lost."""
 
 LEAST_NORMAL = 0.5
-"""Normal over whole force below which the stated frame is wrong: a friction of 1.7."""
+"""Least normal force as a share of the whole force; with less, which would be a friction of 1.7,
+the stated frame is wrong."""
 
 LARGEST_CLOCK_OFFSET = 0.03
 """Least difference of both arms' clocks that is reported [s]: the box transmits normal forces at
 once."""
 
 LARGEST_DELAY = 5.0
-"""Largest delay between two clocks that is considered [s]."""
+"""Largest delay between the clocks of both arms that is considered [s]."""
 
 LONGEST_STEP = 0.5
-"""Usual step of a recording above which its times are in another unit [s]."""
+"""Largest usual time step of a recording [s]; with a larger one, the times are in another unit."""
 
 LONGEST_LEVER = 10.0
-"""Moments about the pads over normal forces, over the radius of their patch, above which moments
-are in another unit. Pressure at a patch's rim gives 1."""
+"""Largest moment about a pad over the normal force and the patch radius; with a larger one, moments
+are in another unit. Pressure at the rim of the patch gives 1."""
 
 FORCE_UNITS = (("kgf", 1.0 / STANDARD_GRAVITY), ("lbf", 0.224809), ("kN", 1e-3), ("mN", 1e3))
-"""Units that forces are given in by mistake, per newton."""
+"""Units in which forces are stated by mistake, with the number of each unit per newton."""
 
 LIKE_UNIT = 0.2
-"""Largest difference of a force in another unit from the known one, as a share."""
+"""Largest relative difference between a force converted from such a unit and the known force."""
 
 LEAST_PULL, SHARE_PULL = 5.0, 0.2
-"""Pull at pads that are not said to hold from which on a tare is wrong [N], and over the greatest
-normal force."""
+"""Pull on pads outside of labelled holds above which a tare counts as wrong [N], and the same as a
+share of the range of the normal force. The larger of both applies."""
 
 TARE_CHANGE, TARE_ERRORS = 2.0, 6.0
-"""Change of the mean force within a tare from which on an arm touches something [N], and over its
-standard error."""
+"""Change of the mean force within a tare above which an arm counts as touching something [N], and
+the same in standard errors."""
 
 
 @dataclass(frozen=True)
@@ -59,10 +60,10 @@ class Fault:
     """A fault of a recording.
 
     Attributes:
-        run: name of the recording; '' for all.
-        name: of the fault.
-        text: the problem, and the remedy.
-        serious: the run (all runs) cannot be used for sensors, load and friction.
+        run: name of the recording, '' for a fault of all runs together.
+        name: name of the fault.
+        text: the problem and the remedy.
+        serious: True if the run, or all runs, cannot be used for sensors, load and friction.
     """
 
     run: str
@@ -76,10 +77,12 @@ class Fault:
 
 
 def recording_faults(workcell: Workcell, run: Recording, places: Places) -> list[Fault]:
-    """Find the faults of a single run.
+    """Return the faults of a single run.
 
     Args:
-        places: its pads, the sensors' offsets taken out.
+        workcell: the cell.
+        run: the run.
+        places: pad poses and wrenches of the run, without the sensors' offsets.
     """
     found = [*_dropouts(run), *_range_faults(run)]
     if not run.has_moments:
@@ -146,7 +149,7 @@ def _frame_faults(run: Recording, places: Places) -> list[Fault]:
 
 
 def _held(run: Recording) -> Array:
-    """Return (n,) True for samples within a hold."""
+    """Return a mask (n,) that is True for samples within a labelled hold."""
     found = np.zeros(len(run.time), dtype=bool)
     for span in run.labels.held:
         found |= run.within(*span)
@@ -168,8 +171,8 @@ def _unit_faults(workcell: Workcell, run: Recording, places: Places) -> list[Fau
 
 
 def _force_units(run: Recording, places: Places, held: Array) -> list[str]:
-    """Compare forces, independent of frame, with the commanded ones and with those of the other
-    arm."""
+    """Return texts about forces that seem to be in another unit: compared with the commanded
+    forces, and with those of the other arm."""
     force = np.median(np.linalg.norm(places.wrench[held, :, :3], axis=2), axis=0)
     commands = np.isfinite(run.commanded).any(axis=0)
     asked = np.nanmedian(np.where(commands, run.commanded[held], 0.0), axis=0)
@@ -190,7 +193,8 @@ def _force_units(run: Recording, places: Places, held: Array) -> list[str]:
 
 
 def _moment_units(workcell: Workcell, places: Places, held: Array) -> list[str]:
-    """Compare moments about the pads with the capacity of their patches."""
+    """Return texts about moments that seem to be in another unit: moments about the pads compared
+    with the capacity of the patches."""
     normal = np.abs(np.median(places.normal[held], axis=0)).mean()
     for i, contact in enumerate(workcell.contacts):
         moment = float(np.median(np.linalg.norm(places.wrench[held, i, 3:], axis=1)))
@@ -201,7 +205,8 @@ def _moment_units(workcell: Workcell, places: Places, held: Array) -> list[str]:
 
 
 def _dropouts(run: Recording) -> list[Fault]:
-    """Find spans without new data, and holds that are not in the recording."""
+    """Return faults of intervals without new samples, and of labelled holds that the recording does
+    not contain."""
     found = [
         f"nothing new for {end - begin:.2f} s from {begin:.2f} s on" for begin, end in run.lost
     ]
@@ -231,7 +236,8 @@ def _range_faults(run: Recording) -> list[Fault]:
 
 
 def _pad_faults(workcell: Workcell, run: Recording, places: Places) -> list[Fault]:
-    """Find pads that are not where they hold the box, and a squeeze that vanishes."""
+    """Return faults of pads that are not where they should hold the box, and of a squeeze that
+    vanishes during a hold."""
     found = []
     nominal = inverse(workcell.contacts[0].T_box_pad) @ workcell.contacts[1].T_box_pad
     room = sum(contact.patch_radius for contact in workcell.contacts)
@@ -267,7 +273,8 @@ def _pad_faults(workcell: Workcell, run: Recording, places: Places) -> list[Faul
 
 
 def vanished(normal: Array) -> Array:
-    """Return (n,) True where the lesser of both normal forces (n, 2) vanishes during a hold."""
+    """Return a mask (n,) that is True where the lesser of both normal forces (n, 2) vanishes during
+    a hold."""
     squeeze = normal.min(axis=1)
     usual = np.quantile(squeeze, 0.75) if len(squeeze) else 0.0
     return np.asarray((squeeze < VANISHED * usual) & (usual > 0.0))
@@ -287,11 +294,12 @@ def _clock_faults(run: Recording, places: Places) -> list[Fault]:
 
 
 def load_faults(holds: list[MeasuredHold], load: Load, moments: bool) -> list[Fault]:
-    """Find faults in the balance of all holds: other units, swapped arms, or an unknown cause.
+    """Return faults in the balance of all holds: wrong units, swapped arms, or an unknown cause.
 
     Args:
-        load: their common estimate.
-        moments: whether the sensors tell moments.
+        holds: the still pieces.
+        load: the load estimated from all of them.
+        moments: True if the sensors measure moments.
     """
     left = LARGEST_RESIDUAL * abs(load.mass * GRAVITY[2])
     if load.residual > left:

@@ -99,11 +99,12 @@ class Recording:
         return bool(np.isfinite(self.wrench[:, :, 3:]).all())
 
     def within(self, begin: float, end: float) -> Array:
-        """Return (n,) True for samples between two instants."""
+        """Return a mask (n,) that is True for samples between two instants [s]."""
         return np.asarray((self.time >= begin) & (self.time <= end))
 
     def around(self, instant: float) -> Array:
-        """Return (n,) True for samples near an instant at which both arms stand still."""
+        """Return a mask (n,) that is True for samples within `TARE_TIME` around an instant [s] at
+        which both arms stand still."""
         return self.within(instant - TARE_TIME / 2.0, instant + TARE_TIME / 2.0)
 
 
@@ -111,7 +112,8 @@ class Recording:
 
 
 GAP, LONG_GAP = 10.0, 0.2
-"""A gap is a step of at least this many usual ones and at least this long [s]."""
+"""A step of a recording counts as a gap if it is at least this many usual steps long, and at least
+this long [s]."""
 
 
 @dataclass(frozen=True)
@@ -134,7 +136,8 @@ class ArmLog:
 
 
 def lost_spans(time: Array, values: Array) -> Spans:
-    """Return the spans without samples, or with identical values (m, k) in all of them."""
+    """Return the intervals [s] without samples, or in which all samples repeat the same values (m,
+    k)."""
     steps = np.diff(time)
     long = np.flatnonzero(steps > max(GAP * float(np.median(steps)), LONG_GAP))
     same = (np.diff(values, axis=0) == 0.0).all(axis=1)
@@ -151,15 +154,18 @@ def together(
     frame: str,
     largest: Array | None = None,
 ) -> Recording:
-    """Merge the recordings of both arms into a run, the second interpolated at the times of the
-    first.
+    """Merge the recordings of both arms into a run, the second arm's interpolated at the times of
+    the first arm's.
 
     Args:
-        name: of its file.
-        labels, frame, largest: see `Recording`.
+        name: name of the recording.
+        recorded: the recording of each arm.
+        labels: labels of the side file.
+        frame: frame of the wrenches, one of `FRAMES`.
+        largest: (2,) largest measurable force and moment [N, N m]; None if not stated.
 
     Raises:
-        ResultsError: they hardly recorded at the same time.
+        ResultsError: the two recordings hardly overlap in time.
     """
     first, second = recorded
     steps = np.array([np.median(np.diff(each.time)) for each in recorded])
@@ -189,11 +195,11 @@ def together(
 
 
 def read_run(path: Path, workcell: Workcell) -> Recording:
-    """Read a run and its side file, the same name with the ending `.toml`.
+    """Read a recorded run and its side file, which has the same name with the suffix `.toml`.
 
     Raises:
         ResultsError: the recording cannot be read, or lacks a column.
-        WorkcellError: with all problems of the side file.
+        WorkcellError: the side file is wrong; the message lists all problems.
     """
     side = path.with_suffix(".toml")
     try:
@@ -266,7 +272,8 @@ def _read_arm(table: TableReader, path: Path, workcell: Workcell, arm: int) -> A
 
 
 def _read_bag(table: TableReader, file: Path, names: list[str]) -> ArmLog:
-    """Read one arm's recording in ROS 2, at the times of its joint states."""
+    """Read one arm's recording from ROS 2, at the times of its joint states. `names` are the names
+    of the joints."""
     if table.has("joints"):
         value = table.raw("joints")
         if not isinstance(value, list) or len(value) != len(names):
@@ -298,8 +305,8 @@ def _read_bag(table: TableReader, file: Path, names: list[str]) -> ArmLog:
 
 
 def _csv_columns(path: Path) -> dict[str, Array]:
-    """Read columns by name, separated by commas, semicolons or blanks; empty values are not
-    finite."""
+    """Read the columns of a CSV file by name, separated by commas, semicolons or blanks; empty
+    cells become NaN."""
     try:
         text = safe_io.text(read_bytes(path))
         dialect = csv.Sniffer().sniff(text.partition("\n")[0], ",; \t")
@@ -362,10 +369,11 @@ def places_of(workcell: Workcell, run: Recording) -> Places:
 
 
 def tared(run: Recording, places: Places) -> tuple[Places, Array]:
-    """Subtract the sensors' offsets from a run, each as at the tare before.
+    """Subtract the sensors' offsets from the wrenches of a run; the offset at a sample is the one
+    measured at the last tare before it.
 
     Returns:
-        the readings without them, and (k, 2, 6) the offsets of the k tares that were recorded.
+        The places with these wrenches, and the offsets (k, 2, 6) of the k recorded tares [N, N m].
     """
     instants = [instant for instant in sorted(run.labels.tare) if run.around(instant).any()]
     if not instants:
@@ -378,19 +386,19 @@ def tared(run: Recording, places: Places) -> tuple[Places, Array]:
 ENDINGS = (".mcap", ".db3")
 
 Messages = list[tuple[float, Any]]
-"""Messages, each after its time since the recording's begin [s]."""
+"""Messages of a topic, each with its time since the begin of the recording [s]."""
 
 
 def is_bag(path: Path) -> bool:
-    """Return True if a path is a recording of ROS 2, by its name."""
+    """Return True if a path has the name of a ROS 2 recording."""
     return path.is_dir() or path.suffix.lower() in ENDINGS
 
 
 def read_topics(path: Path, topics: Collection[str]) -> dict[str, Messages]:
-    """Read the messages of some topics.
+    """Read the messages of some topics of a ROS 2 recording, by topic.
 
     Raises:
-        ResultsError: it cannot be read, lacks a topic, or rosbags is not installed.
+        ResultsError: the recording cannot be read or lacks a topic, or rosbags is not installed.
     """
     try:
         from rosbags.highlevel import AnyReader, AnyReaderError
@@ -420,10 +428,11 @@ def read_topics(path: Path, topics: Collection[str]) -> dict[str, Messages]:
 
 
 def joint_series(messages: Messages, names: list[str], path: Path) -> tuple[Array, Array]:
-    """Return times (n,) [s] and positions (n, joints) of JointState messages that have all joints.
+    """Return times (n,) [s] and joint positions (n, joints) [rad or m] of the JointState messages
+    that contain all joints.
 
     Raises:
-        ResultsError: none has.
+        ResultsError: no message contains all joints.
     """
     times, rows, seen = [], [], set()
     for time, message in messages:
@@ -450,8 +459,8 @@ def wrench_series(messages: Messages) -> tuple[Array, Array]:
 
 
 def force_series(messages: Messages) -> tuple[Array, Array]:
-    """Return times (n,) [s] and normal forces (n,) [N] from numbers, or from wrenches along z of
-    either sign."""
+    """Return times (n,) [s] and normal forces (n,) [N] from messages with a number, or from
+    wrenches, of which the absolute force along z is taken."""
     if messages and hasattr(messages[0][1], "data"):
         return (
             np.array([time for time, _ in messages]),
