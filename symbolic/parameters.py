@@ -54,17 +54,17 @@ TASK, HELD, START, BODIES = "task_numbers", "held_numbers", "start_numbers", "bo
 ARM_GROUPS = ("arm_1_numbers", "arm_2_numbers")
 SQUEEZES = ("squeeze_1_numbers", "squeeze_2_numbers")
 GROUPS = frozenset((TASK, HELD, START, BODIES, *ARM_GROUPS, *SQUEEZES))
-"""Names of the groups, which end functions' inputs."""
+"""Names of all groups of parameters; functions take the groups as their last inputs."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter array in a topology: its group, key and shape, without values.
+    """Stands for a parameter array in a topology: group, key and shape, without the values.
 
     Attributes:
-        group: they belong to.
-        key: path in the workcell file, or a description.
-        shape: () of one.
+        group: name of the group.
+        key: key path in the workcell file, or a description.
+        shape: shape of the array, () for a single number.
     """
 
     group: str
@@ -74,14 +74,14 @@ class Parameter:
 
 @dataclass(frozen=True)
 class LazyParameter:
-    """Parameters that are computed on first use."""
+    """A parameter array of known shape whose values are computed on first use."""
 
     shape: tuple[int, ...]
     find: Callable[[], Array]
 
 
 class _Collector:
-    """Collects parameters: places stay in the topology, values are stored separately."""
+    """Collects the values of parameters and puts a `Parameter` in the place of each."""
 
     def __init__(self) -> None:
         self.entries: dict[str, list[tuple[Parameter, Array | LazyParameter]]] = {}
@@ -108,8 +108,8 @@ class _Collector:
 
 
 class _Symbols:
-    """Replaces the same parameters by slices of one vector of symbols per group, in the order in
-    which they were collected."""
+    """Puts a slice of a group's vector of symbols in the place of each parameter, in the order in
+    which the values were collected."""
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
         self._groups = {
@@ -144,10 +144,10 @@ _Take = _Collector | _Symbols
 
 @dataclass(frozen=True)
 class WorkcellParameters:
-    """Parameters and topology of a cell without its bodies.
+    """Parameters and topology of a cell, without its collision bodies.
 
     Attributes:
-        cell: the description.
+        cell: description of the cell.
     """
 
     cell: Workcell
@@ -159,7 +159,8 @@ class WorkcellParameters:
 
     @property
     def workcell(self) -> NumberedWorkcell:
-        """The cell with places instead of numbers."""
+        """The cell's topology: its description with a `Parameter` in the place of every
+        parameter."""
         return self._collected[1]
 
     @property
@@ -168,21 +169,22 @@ class WorkcellParameters:
 
     @property
     def layout(self) -> dict[str, tuple[Parameter, ...]]:
-        """Entries of every group but the start postures, in order."""
+        """Parameters of every group except the start postures, in the order of the group's
+        vector."""
         return {name: tuple(each for each, _ in found) for name, found in self._entries.items()}
 
     @cached_property
     def sizes(self) -> dict[str, int]:
-        """Number of parameters per group but the start postures."""
+        """Length of every group's vector, except that of the start postures."""
         return {
             name: sum(prod(each.shape) for each in found) for name, found in self.layout.items()
         }
 
     def vector(self, name: str) -> Array:
-        """Return the parameters (n,) of a group.
+        """Return the values (n,) of a group's parameters.
 
         Raises:
-            SettingsError: the pads do not close the grasp that they are of.
+            SettingsError: the group describes a grasp whose pads cannot close it.
         """
         if name not in self._vectors:
             parts = [
@@ -197,7 +199,7 @@ class WorkcellParameters:
 
     @property
     def digest(self) -> str:
-        """Digest of the topology without bodies."""
+        """Digest of the topology without collision bodies."""
         return self._without_arms
 
     @cached_property
@@ -205,7 +207,7 @@ class WorkcellParameters:
         return digest_of_parts((self.workcell,))
 
     def symbols(self) -> NumberedWorkcell:
-        """Return the cell with symbols instead of numbers."""
+        """Return the cell's description with symbols in the place of all parameters."""
         return _workcell(self._symbols(), self.cell)
 
     def _symbols(self, further: Mapping[str, int] = MappingProxyType({})) -> _Symbols:
@@ -214,11 +216,11 @@ class WorkcellParameters:
 
 @dataclass(frozen=True)
 class CellParameters(WorkcellParameters):
-    """Parameters and topology of a whole cell.
+    """Parameters and topology of a cell with its collision bodies.
 
     Attributes:
-        bounds: what bounds of distances are made of.
-        models: of both arms.
+        bounds: parameters of the distance bounds of all pairs.
+        models: models of both arms.
     """
 
     bounds: Screen
@@ -231,7 +233,7 @@ class CellParameters(WorkcellParameters):
 
     @property
     def screen(self) -> Screen:
-        """The bounds with places instead of numbers."""
+        """The topology of the distance bounds: a `Parameter` in the place of every parameter."""
         return self._of_bodies[1]
 
     @property
@@ -240,7 +242,7 @@ class CellParameters(WorkcellParameters):
 
     @cached_property
     def digest(self) -> str:
-        """Digest of the topology without bodies except the arms' own."""
+        """Digest of the topology of workcell and arms, without other collision bodies."""
         arms = tuple(
             (model.model.saveToString(), model.flange_id, model.redundant, model.pose_size)
             for model in self.models
@@ -249,14 +251,14 @@ class CellParameters(WorkcellParameters):
 
     @cached_property
     def bodies_digest(self) -> str:
-        """Digest of the whole topology."""
+        """Digest of the topology of the whole cell, collision bodies included."""
         return digest_of_parts((self.digest, self.screen))
 
     def symbolic(self, bodies: CellBodies) -> CellModel:
-        """Build the model whose functions take the parameters as inputs.
+        """Return the symbolic model whose functions take the parameters as inputs.
 
         Args:
-            bodies: of the cell, or of another one of the same structure.
+            bodies: arms and bodies of this cell, or of one with the same topology.
         """
         joints = [model.n_joints for model in self.models]
         take = self._symbols({START: sum(joints)})
@@ -273,7 +275,8 @@ class CellParameters(WorkcellParameters):
 
 
 def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
-    """Take the parameters of the cell; those that no formula reads are left out."""
+    """Replace the parameters in a cell's description by what `take` returns for them. Values that
+    no formula uses are set to constants."""
     pairs = zip(cell.robots, cell.contacts, strict=True)
     first, second = (_robot(take, i, *pair) for i, pair in enumerate(pairs))
     payload: Any = replace(cell.payload, size=np.zeros(3), shape=None, jerk_max=None)
@@ -324,8 +327,8 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
 def _grasp(
     take: _Take, group: str, path: str, cell: Workcell, commanded: int | None
 ) -> GraspNumbers:
-    """Take the derived quantities of a grasp by pads with any normals, with or without a
-    commanded force."""
+    """Return the constants of a grasp as parameters that are computed on first use. `commanded` is
+    the index of the robot whose force is commanded, None for planned forces."""
 
     @cache
     def found() -> GraspNumbers:
@@ -351,7 +354,7 @@ def _grasp(
 
 
 def _as(kind: Any, record: Any, **changes: Any) -> Any:
-    """Build a record of parameters with the fields of a plain one, some changed."""
+    """Return a record of class `kind` with the fields of another record, some of them changed."""
     known = {each.name: getattr(record, each.name) for each in fields(record)}
     return kind(**(known | changes))
 
@@ -387,7 +390,8 @@ def _split(T: Array) -> tuple[Array, Array]:
 
 
 def _turn(take: _Take, group: str, path: str, rotation: Array) -> Any:
-    """Take the rotation of a base; an upright base is topology, as most are."""
+    """Return the rotation of a base with its parameters replaced. For an upright base these are
+    cosine and sine of one angle, for a tilted base the whole matrix."""
     level = np.array([0.0, 0.0, 1.0])
     if np.array_equal(rotation[2], level) and np.array_equal(rotation[:, 2], level):
         cosine, sine = rotation[0, 0], rotation[1, 0]
@@ -461,7 +465,8 @@ def _joint(take: _Take, joint: RedundantJoint) -> NumberedJoint:
 
 
 def _screen(take: _Take, screen: Screen) -> Screen:
-    """Take the screen's parameters: all except the shapes of links and of meshes."""
+    """Replace the parameters of the distance bounds by what `take` returns for them. Shapes of
+    links and of meshes remain part of the topology."""
     first, second = (_base(take, f"robots[{i}]", base) for i, base in enumerate(screen.bases))
     return replace(
         screen,
@@ -482,7 +487,8 @@ def _base(take: _Take, path: str, base: ScreenBase) -> ScreenBase:
 
 @lru_cache(maxsize=512)
 def _collected_body(seen: CacheKey) -> tuple[Any, list[tuple[Parameter, Array | LazyParameter]]]:
-    """Collect a body's parameters, cached because variants of a cell share most bodies."""
+    """Collect the parameters of one body. The result is cached, because variants of a cell share
+    most bodies."""
     take, (path, body) = _Collector(), seen.given
     return _body(take, path, body), take.entries.get(BODIES, [])
 
@@ -498,7 +504,7 @@ def _body(take: _Take, path: str, body: ScreenBody) -> Any:
 
 
 def _own(take: _Take, path: str, value: Any) -> Any:
-    """Take every array of a record, in the order of its fields."""
+    """Replace every array of a record by what `take` returns for it, in the order of the fields."""
     if isinstance(value, np.ndarray) and value.size:
         return take(BODIES, path, value)
     if isinstance(value, tuple):

@@ -80,8 +80,8 @@ def propose_grip(
             tried and their total.
 
     Raises:
-        SettingsError: both ranges are empty or a range is reversed, the cell's pads are not
-            supported, or the path cannot be driven with any place in the ranges.
+        SettingsError: a range is reversed or begins below -1 m, the forces have no closed form, a
+            face is not upright, or the path cannot be driven with any place in the ranges.
     """
     for low, high in (up, along):
         if not -1.0 <= low <= high <= 1.0:

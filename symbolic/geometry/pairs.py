@@ -43,20 +43,20 @@ from symbolic.records.content import CacheKey, digest_of_parts
 from symbolic.records.problems import matching
 
 MOST_ENTERED = 1e-3
-"""Depth by which a tool may be drawn into the payload, as pads that give way are [m]."""
+"""Depth to which a tool may be drawn into the payload [m], because pads give way."""
 
 CONTACT_POSTURES = 300
-"""Random postures in which a pair has to touch to count as always touching."""
+"""Number of random postures in all of which a pair has to touch to be excluded as always
+touching."""
 
 
 FAR = "far_"
-"""Prefix of the functions of the pairs that few cells check, see `CellGeometry.near`."""
+"""Prefix of the functions for pairs that few cells check; see `CellGeometry.near`."""
 
 
 @dataclass(frozen=True)
 class ActivePair:
-    """Two bodies, as indices into the cell's bodies, to be checked now, or with other
-    parameters."""
+    """Indices of two bodies whose distance is checked, in this cell or with other parameters."""
 
     first: int
     second: int
@@ -64,7 +64,7 @@ class ActivePair:
 
 @dataclass(frozen=True)
 class ExcludedPair:
-    """Two bodies that are not checked, with the reason."""
+    """Names of two bodies that are not checked, and the reason."""
 
     first: int
     second: int
@@ -73,19 +73,20 @@ class ExcludedPair:
 
 @dataclass(frozen=True)
 class CellGeometry:
-    """Collision model of a workcell.
+    """Collision bodies of a workcell, and the pairs of bodies that are checked.
 
     Attributes:
-        workcell: the description.
+        workcell: description of the cell.
         bodies: all collision bodies.
-        arms: the joints of both arms as numbers.
-        active: pairs to be checked; the order of every clearance vector.
+        arms: joints of both arms in numbers.
+        active: pairs that are checked, in the order of all clearance vectors.
         excluded: all other pairs, with the reason.
-        possible: pairs that are checked with some numbers of the cell, or while the box is not
-            held, the active ones among them; the order of compiled functions.
-        near: how many of these come first because most cells check some of them. The others are
-            bounded where some are active: what a grasp holds together, and of every arm what comes
-            before its second joint with anything but its own arm and the payload.
+        possible: pairs that are checked with some values of the cell's parameters, or while the box
+            is not held; the active pairs are among them. They have the order of compiled functions.
+        near: number of possible pairs, from the first, that most cells check. Bounds for the others
+            are computed only if one of those is active: pairs that the grasp holds together, and
+            pairs between the links before an arm's second joint and bodies other than this arm and
+            the payload.
     """
 
     workcell: Workcell
@@ -98,20 +99,21 @@ class CellGeometry:
 
     @cached_property
     def blocks(self) -> Mapping[str, range]:
-        """Return the blocks of possible pairs that are bounded together, by their functions'
-        prefix."""
+        """Ranges of the possible pairs whose bounds are computed together, by the prefix of their
+        functions."""
         far = range(self.near, len(self.possible))
         return {"": range(self.near)} | ({FAR: far} if far else {})
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:
-        """(n_active,) index of every active pair among the possible ones."""
+        """(n_active,) index of each active pair among the possible pairs."""
         places = {pair: k for k, pair in enumerate(self.possible)}
         return np.array([places[pair] for pair in self.active], dtype=np.intp)
 
     @cached_property
     def asked(self) -> tuple[str, ...]:
-        """Prefixes of the blocks to evaluate: the first one, and those with active pairs."""
+        """Prefixes of the blocks that have to be evaluated: the first block, and others with active
+        pairs."""
         blocks = self.blocks.items()
         return tuple(b for b, pairs in blocks if not b or np.isin(self.columns, pairs).any())
 
@@ -130,7 +132,7 @@ class CellGeometry:
 
     @cached_property
     def tolerance(self) -> Array:
-        """(n_active,) `pair_tolerance` of every active pair, in order [m]."""
+        """(n_active,) distance up to which each active pair counts as colliding [m]."""
         bodies = self.bodies
         return np.array(
             [pair_tolerance(self.workcell, bodies[p.first], bodies[p.second]) for p in self.active]
@@ -149,11 +151,10 @@ class CellGeometry:
 
 
 def pair_tolerance(workcell: Workcell, a: CollisionBody, b: CollisionBody) -> float:
-    """Return the distance up to which two bodies count as colliding [m].
+    """Return the distance up to which two bodies count as colliding [m]: the workcell's tolerance.
 
-    That of the workcell, and for the payload how far displaced pads may have it off its place:
-    arms that keep to their paths carry a box that they took hold of elsewhere. Only a set that the
-    cell states says so.
+    For the payload, the uncertain position of the pads is added if the cell states an uncertainty:
+    arms that keep to their paths carry a displaced box displaced.
     """
     return _tolerance(workcell, "box" in (a.frame.kind, b.frame.kind))
 
@@ -164,7 +165,7 @@ def _tolerance(workcell: Workcell, of_payload: bool) -> float:
 
 
 def build_geometry(workcell: Workcell) -> CellGeometry:
-    """Read all shapes of a workcell and sort its pairs.
+    """Read all collision shapes of a workcell, and decide which pairs of bodies are checked.
 
     Raises:
         CollisionModelError: a shape is unusable, a part of a tool enters the payload, or an ignored
@@ -185,7 +186,8 @@ def build_geometry(workcell: Workcell) -> CellGeometry:
 def _sorted_pairs(
     given: CacheKey,
 ) -> tuple[tuple[ActivePair, ...], tuple[ExcludedPair, ...], tuple[ActivePair, ...], int]:
-    """Sort the pairs: active, excluded, possible, and the number of possible ones that are near."""
+    """Return the active, the excluded and the possible pairs, and the number of possible pairs that
+    are near."""
     workcell, bodies, arms, ignored = given.given
     # Pairs within an arm are sorted as if its root were the world: where it stands does not matter.
     at_roots = tuple(b if b.root is None else replace(b, pieces=b.root[1]) for b in bodies)
@@ -224,8 +226,13 @@ def _sorted_pairs(
 
 @cache
 def _is_own(first: str, first_stands: bool, second: str, second_stands: bool) -> bool:
-    """Return True if a pair is of one arm and its own parts or the box, and the other arm cannot
-    change it. Takes the groups of both bodies, and whether each stands on an arm's root."""
+    """Return True if both bodies belong to the same arm, or one of them to an arm and the other is
+    the payload, so that the other arm has no influence on their distance.
+
+    Args:
+        first, second: groups of the bodies.
+        first_stands, second_stands: whether the body is fixed to an arm's root.
+    """
     groups = {first, second}
     if "payload" in groups and (first_stands or second_stands):
         return False
@@ -243,8 +250,8 @@ def _arms_of(body: CollisionBody) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class _PairStatus:
-    """Status of a pair: the reason to exclude it, '' if active; whether it is possible, and whether
-    it is far."""
+    """Result for a pair: the reason to exclude it, '' if it is active; whether it is possible; and
+    whether few cells check it."""
 
     reason: str
     possible: bool
@@ -270,7 +277,8 @@ def _sorted(seen: CacheKey) -> _PairStatus:
 
 
 def _is_far(a: CollisionBody, b: CollisionBody) -> bool:
-    """Return True for a pair that few cells check, see `CellGeometry.near`."""
+    """Return True for a pair that few cells check: a body before an arm's second joint, and a body
+    other than this arm and the payload."""
     still = any(x.root is not None or (x.frame.joint == 0 and not x.is_tool) for x in (a, b))
     return still and a.group != b.group and "payload" not in (a.group, b.group)
 
@@ -278,8 +286,12 @@ def _is_far(a: CollisionBody, b: CollisionBody) -> bool:
 def tools_in_payload(
     bodies: Sequence[CollisionBody], T_joint_box: Sequence[Array]
 ) -> Iterator[CollisionBody]:
-    """Yield the tool parts that penetrate the payload beyond touching, with the payload at (4, 4)
-    in the frame of each arm's last joint."""
+    """Yield the parts of tools that enter the payload by more than `MOST_ENTERED`.
+
+    Args:
+        bodies: all collision bodies.
+        T_joint_box: (4, 4) per arm, pose of the box in the frame of the arm's last joint.
+    """
     payload = next(body for body in bodies if body.frame.kind == "box")
     cores = [shrunk(piece, MOST_ENTERED) for piece in payload.pieces]
     for body in bodies:
@@ -290,7 +302,11 @@ def tools_in_payload(
 
 
 def _check_tools(bodies: tuple[CollisionBody, ...], arms: tuple[ArmGeometry, ArmGeometry]) -> None:
-    """Check that tools do not penetrate the payload that they hold beyond touching."""
+    """Check that no part of a tool enters the payload that it holds by more than `MOST_ENTERED`.
+
+    Raises:
+        CollisionModelError: a part enters.
+    """
     for body in tools_in_payload(bodies, [arm.T_joint_box for arm in arms]):
         raise CollisionModelError(
             f"the tool part {body.name!r} enters the payload by more than "
@@ -301,8 +317,8 @@ def _check_tools(bodies: tuple[CollisionBody, ...], arms: tuple[ArmGeometry, Arm
 
 
 def _rigid(a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> str:
-    """Exclude a pair that does not move relative to each other: fixed, or held by the exact
-    grasp."""
+    """Return the reason to exclude a pair whose bodies do not move relative to each other, because
+    both are fixed to the same link or held by the grasp; '' for other pairs."""
     if a.frame != b.frame and "box" not in (a.frame.kind, b.frame.kind):
         return ""
     for robot in (0, 1):
@@ -320,7 +336,8 @@ def _rigid(a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeome
 
 
 def _neighbours(a: CollisionBody, b: CollisionBody, bodies: tuple[CollisionBody, ...]) -> str:
-    """Exclude links of one arm with no shape on the joints between them."""
+    """Return the reason to exclude two links of one arm that have no link with a shape between
+    them; '' for other pairs."""
     for standing, link in ((a, b), (b, a)):
         if link.frame.robot in (standing.carries or ()) and not link.is_tool:
             before = [
@@ -337,8 +354,8 @@ def _neighbours(a: CollisionBody, b: CollisionBody, bodies: tuple[CollisionBody,
 def _always_touching(
     a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]
 ) -> str:
-    """Exclude a pair within an arm (with the box it holds) that touches in every sampled
-    posture."""
+    """Return the reason to exclude a pair of an arm's bodies, the held box included, that touches
+    in every sampled posture; '' for other pairs."""
     own = {body.group for body in (a, b) if body.carries is None}
     for robot in _movers(a, b):
         group = f"robot {robot + 1}"
@@ -363,10 +380,11 @@ def _always_touching(
 def ignored_pairs(
     workcell: Workcell, bodies: Sequence[CollisionBody]
 ) -> Mapping[frozenset[str], str]:
-    """Return the reason of every ignored pair, by the names of its bodies.
+    """Return the reason of every pair that the workcell file or an SRDF ignores, by the names of
+    both bodies.
 
-    What the workcell file says counts before an SRDF. A link that an SRDF names and that has no
-    collision shape is passed over.
+    The workcell file has precedence over an SRDF. A link without collision shape in an SRDF is
+    skipped.
 
     Raises:
         CollisionModelError: a name or pattern of `collision.ignored` matches no body.
@@ -405,7 +423,7 @@ def ignored_pairs(
 
 
 def anchor(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry], robot: int) -> CollisionBody:
-    """Return the body, with a held box represented as part of a robot's last link."""
+    """Return a body; the held box as a part of the last link of arm `robot`."""
     if body.frame.kind != "box":
         return body
     known = body.content, arms[robot].content, robot
@@ -420,7 +438,8 @@ def _anchored(seen: CacheKey) -> CollisionBody:
 
 
 def _movers(a: CollisionBody, b: CollisionBody) -> tuple[int, ...]:
-    """Return the robots that may move one body against the other; both may hold the payload."""
+    """Return the indices of the arms that may move one body relative to the other. Both arms may
+    hold the payload."""
     if "box" in (a.frame.kind, b.frame.kind):
         return (0, 1)
     return tuple(robot for robot in (0, 1) if robot in (a.frame.robot, b.frame.robot))
@@ -429,7 +448,7 @@ def _movers(a: CollisionBody, b: CollisionBody) -> tuple[int, ...]:
 def _ordered(
     a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry], robot: int
 ) -> tuple[CollisionBody, CollisionBody]:
-    """Return both bodies as `anchor` represents them, the one on the later joint last."""
+    """Return both bodies as `anchor` represents them, sorted by the index of their joint."""
     left, right = anchor(a, arms, robot), anchor(b, arms, robot)
     return (left, right) if left.frame.joint <= right.frame.joint else (right, left)
 
@@ -440,7 +459,8 @@ def out_of_reach(
     arms: tuple[ArmGeometry, ArmGeometry],
     tolerance: float,
 ) -> str:
-    """Exclude a pair that a bound of their relative motion keeps apart."""
+    """Return the reason to exclude a pair that never meets because a bound of the relative motion
+    keeps both bodies apart by more than `tolerance` [m]; '' for other pairs."""
     margin = tolerance + 1e-3
     if {a.frame.robot, b.frame.robot} == {0, 1}:
         zones = [_zone(body, arms[body.frame.robot], -1) for body in (a, b)]
@@ -489,11 +509,12 @@ def never_meet(
     arms: tuple[ArmGeometry, ArmGeometry],
     tolerance: float,
 ) -> str:
-    """Exclude bodies two joints apart that no position of the two joints brings together.
+    """Return the reason to exclude two bodies with two joints between them that collide at no
+    position of these joints; '' for other pairs.
 
-    The farther body is replaced by its swept cylinder about the second joint's axis; the first
-    joint's range is cut into intervals, each cleared by the distance at its middle, which is
-    more than the body can move within half the interval.
+    The farther body is replaced by the cylinder that it sweeps about the second joint's axis. The
+    range of the first joint is cut into intervals, each proven free by the distance at its middle,
+    which exceeds the motion of the body within half the interval.
     """
     for robot in _movers(a, b):
         arm, (low, high) = arms[robot], _ordered(a, b, arms, robot)
@@ -528,11 +549,11 @@ def never_meet(
 
 
 def _zone(body: CollisionBody, arm: ArmGeometry, below: int) -> Piece:
-    """Compute the region that a body behind joint `body.frame.joint` can reach, seen from joint
-    `below` (-1: world).
+    """Return a region that contains a body in all positions of the joints before it, in the frame
+    of joint `below` (-1: world).
 
-    One joint that turns between them: the swept cylinder about its axis. Else the ball about the
-    first joint's origin whose radius is the stretched chain.
+    With one rotating joint between, the region is the cylinder swept about that joint's axis. Else
+    it is the ball about the first joint's origin with the length of the stretched chain as radius.
     """
     return _zone_of(CacheKey(body, arm, below, known=(body.content, arm.content, below)))
 
@@ -546,7 +567,7 @@ def _zone_of(seen: CacheKey) -> Piece:
 
 @lru_cache(maxsize=256)
 def _zone_in_root(seen: CacheKey) -> Piece:
-    """Compute the same region, seen from the arm's root instead of the world."""
+    """Return the region of `_zone` in the frame of the arm's root."""
     body, arm, below = seen.given
     first = below + 1
     T = arm.origins[first]
@@ -556,7 +577,8 @@ def _zone_in_root(seen: CacheKey) -> Piece:
 
 
 def chain_radius(body: CollisionBody, arm: ArmGeometry, first: int) -> float:
-    """Bound the distance of any point of a body from the origin of joint `first` before it [m]."""
+    """Return an upper bound of the distance of the body's points from the origin of an earlier
+    joint with index `first` [m]."""
     behind = slice(first + 1, body.frame.joint + 1)
     offsets = np.linalg.norm(arm.origins[behind, :3, 3], axis=1) + arm.slides[behind]
     own = max(farthest_from_point(piece, np.zeros(3)) for piece in body.pieces)
@@ -564,8 +586,8 @@ def chain_radius(body: CollisionBody, arm: ArmGeometry, first: int) -> float:
 
 
 def relative_placement(arm: ArmGeometry, below: int, joint: int, q: Array) -> Array:
-    """Compute the pose (4, 4) of a joint's frame in the frame of an earlier joint (-1: world) at
-    q (n,)."""
+    """Return the pose (4, 4) of joint `joint` in the frame of an earlier joint `below` (-1: world)
+    at joint positions q (n,)."""
     T: Array = arm.T_world_root if below < 0 else np.eye(4)
     for k in range(below + 1, joint + 1):
         moved = np.eye(4)

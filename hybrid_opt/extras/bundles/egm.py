@@ -27,26 +27,30 @@ from symbolic.records import Workcell
 
 TASKS = ("T_ROB1", "T_ROB2")
 TWO_ARMED_TASKS = ("T_ROB_L", "T_ROB_R")
-"""Task names of two robots, and of the two seven-axis arms of a YuMi."""
+"""Names of the controller's tasks for the two seven-axis arms of a YuMi."""
 
 EXTRA = 2
-"""Index along the chain of the joint that ABB counts as a seven-axis arm's seventh, `eax_a`."""
+"""Index, along the kinematic chain, of the joint of a seven-axis arm that ABB calls the seventh,
+`eax_a`."""
 
 START_TOLERANCE = 1.0
-"""How far an arm may be from the first position [degrees]; farther, the program ends."""
+"""Largest distance of a joint from the first position [degrees]; if it is larger, the program
+ends."""
 
 UNKNOWN_TOOL_MASS = 0.1
-"""[kg] where the workcell gives no `tool_load`; RAPID wants more than none."""
+"""Mass of the tool if the workcell has no `tool_load` [kg]; RAPID does not accept zero."""
 
 
 def require_egm(workcell: Workcell, leader: int) -> None:
-    """Refuse a cell whose pressing arm has no force sensor, or with arms of unknown lag.
+    """Check that the pressing arm of a cell has force control, and that the lag of both arms is
+    known.
 
     Args:
-        leader: index of the arm that keeps its place.
+        workcell: the cell.
+        leader: index of the arm that keeps its position; the other arm presses.
 
     Raises:
-        SettingsError: with the reason.
+        SettingsError: force control is missing or a lag is unknown.
     """
     robots = workcell.robots
     robot, other = robots[1 - leader], robots[leader]
@@ -70,13 +74,14 @@ def require_egm(workcell: Workcell, leader: int) -> None:
 
 
 def tasks_of(export: Export) -> tuple[str, str]:
-    """Return the names of both tasks."""
+    """Return the names of both arms' tasks on the controller."""
     two_armed = all(len(joints) == SEVEN for joints in export.job.joint_names)
     return TWO_ARMED_TASKS if two_armed else TASKS
 
 
 def _checked_start(joints: int) -> Iterator[str]:
-    """Yield the check of the first position, without a move to it: that way is not checked for
+    """Yield the lines of the RAPID procedure that ends the program if the arm is not at the first
+    position. It makes no move to that position, because such a move would not be checked for
     collisions."""
     axes = [f"robax.rax_{axis}" for axis in range(1, SIX + 1)]
     axes += ["extax.eax_a"] if joints == SEVEN else []
@@ -94,7 +99,8 @@ def _checked_start(joints: int) -> Iterator[str]:
 
 
 def _tool(export: Export, arm: int) -> str:
-    """Write a tooldata: the pad's frame on the flange, and the tool's load if it is known."""
+    """Return RAPID's tooldata of an arm: the pad's frame on the flange, and the load of the tool if
+    the workcell states it."""
     robot = export.workcell.robots[arm]
     frame = _frame(robot.T_flange_pad)
     if robot.tool_load is None:
@@ -105,19 +111,21 @@ def _tool(export: Export, arm: int) -> str:
 
 
 def _load(mass: float, centre: Array, inertia: Array) -> str:
-    """Write a loaddata from a mass [kg], a centre of mass (3,) [mm] and moments (3,) [kg m^2]."""
+    """Return RAPID's loaddata for a mass [kg], a centre of mass (3,) [mm] and principal moments of
+    inertia (3,) [kg m^2]."""
     return f"[{mass:.4f},{_numbers(centre)},[1,0,0,0],{_numbers(inertia)[1:-1]}]"
 
 
 def _frame(pose: Array) -> str:
-    """Write a RAPID pose: position [mm] and quaternion, real part first."""
+    """Return RAPID's pose of a transform (4, 4): position [mm] and quaternion with the real part
+    first."""
     turn = Rotation.from_matrix(pose[:3, :3]).as_quat(scalar_first=True)
     return f"[{_numbers(1e3 * pose[:3, 3])},{_numbers(turn)}]"
 
 
 def _target(degrees: Array) -> str:
-    """Write a jointtarget; a seventh axis is an external one to RAPID, other external axes are
-    unused."""
+    """Return RAPID's jointtarget for joint positions (joints,) [degrees]. The seventh joint counts
+    as an external axis; the other external axes are unused."""
     if len(degrees) == SIX:
         return f"[{_numbers(degrees)},[9E9,9E9,9E9,9E9,9E9,9E9]]"
     robot = np.delete(degrees, EXTRA)
@@ -135,11 +143,11 @@ CROSSOVER = 0.3
 """Crossover of the force loop: its gain times its lag."""
 
 LEAST_LAG = 0.01
-"""Least lag that the force loop reckons with [s]."""
+"""Least lag that the design of the force loop assumes [s]."""
 
 MOST_WAY, PRESS_SPEED = 1.5, 2.0
-"""Most travel of the pressing pad beyond its plan, over that of its largest force; largest speed
-over that of the fastest planned change of the force."""
+"""Largest travel of the pressing pad beyond its plan, over the travel for its largest force; and
+largest speed of this travel, over the speed for the fastest planned change of the force."""
 
 DEVIATION = 1.2
 """`MaxSpeedDeviation` over the fastest joint of an arm: abb_robot_driver's README says that it
@@ -147,7 +155,8 @@ seems to limit the speed itself."""
 
 
 def egm_files(export: Export) -> dict[str, str | bytes]:
-    """Write the stream's program, and the code that starts EGM in both tasks."""
+    """Return the files of the target: the program that streams the job, and the RAPID code that
+    starts EGM in both tasks."""
     robots, follower, q = export.workcell.robots, export.follower, export.sampled.q
     J = pad_jacobians(export.workcell, follower, export.sampled.arm(follower, q))
     # Along the pad's normal, without turning it.

@@ -57,35 +57,37 @@ RATES = {"simulation": 1000, "franka": 1000, "ur": 500}
 """Rate of each driver's cycle [Hz]."""
 
 TORQUE_STEPS = (0.02, 0.01, 0.005)
-"""Time steps between two points [s]."""
+"""Time steps between the points of the trajectory that are tried, in this order [s]."""
 
 GAIN, DAMPING = 7.0, 0.7
 """Stiffness of a joint over its largest torque [1/rad], and damping ratio at its mean inertia."""
 
 FASTEST = 250.0
-"""Largest natural frequency of a joint under its gains [rad/s], half of the slowest driver's rate:
-light joints are softer, so that a sampled controller keeps them stable."""
+"""Largest natural frequency of a joint under its gains [rad/s], half of the slowest driver's rate.
+Joints with little inertia get lower gains, so that a sampled controller keeps them stable."""
 
 MODEL_STRIDE = 10
-"""Stride of the job's own samples at which inertia and stiffness are computed."""
+"""Inertia and stiffness are computed at every sample of the job with this stride."""
 
 TORQUE_RATE = 1000.0
-"""Fastest change of a torque that libfranka takes [N m/s] (kMaxTorqueRate)."""
+"""Fastest change of a torque that libfranka accepts [N m/s] (kMaxTorqueRate)."""
 
 CONTACT, SPARE_FORCE, SPARE_TORQUE = 1.5, 20.0, 5.0
-"""A collision exceeds this multiple of the planned contact by this force [N] or torque [N m]."""
+"""A collision is reported if a measured force or torque exceeds this multiple of the planned one by
+this force [N] or torque [N m]."""
 
 UR_TYPE = r"(?<![a-z0-9])ur\d+e?(?![a-z0-9])"
 
 FRANKA_TYPES = ("fer", "fp3", "fr3", "fr3v2")
-"""Arms that franka_description has (folder `robots`), by the beginnings of their joints' names."""
+"""Arms in franka_description (folder `robots`), by the prefixes of their joints' names."""
 
 
 def driver_of(workcell: Workcell) -> str:
-    """Return the driver of the arms, 'franka' or 'ur'; 'simulation' for arms without an address.
+    """Return the name of the driver for both arms, 'franka' or 'ur'; 'simulation' if no arm has an
+    address.
 
     Raises:
-        SettingsError: there is no driver for arms with addresses, or only one has an address.
+        SettingsError: only one arm has an address, or no driver takes torques for these arms.
     """
     addresses = [robot.driver.address for robot in workcell.robots]
     if not any(addresses):
@@ -109,7 +111,11 @@ def driver_of(workcell: Workcell) -> str:
 
 
 def require_torque(job: Job) -> None:
-    """Refuse joints that franka_ros2 does not know."""
+    """Check that franka_ros2 knows the names of the joints, if the arms are Franka's.
+
+    Raises:
+        SettingsError: it does not know the names, or a prefix does not end with '_'.
+    """
     if driver_of(job.workcell) != "franka":
         return
     for robot, joints in zip(job.workcell.robots, job.joint_names, strict=True):
@@ -127,16 +133,18 @@ def require_torque(job: Job) -> None:
 
 
 def joint_stiffness(job: Job) -> Array:
-    """Return the proportional gains (joints,) of both arms [N m/rad, N/m]."""
+    """Return the proportional gains (joints,) of all joints of both arms [N m/rad, for sliding
+    joints N/m]."""
     largest = job.workcell.stack_joint_limits("torque_max")
     return np.minimum(GAIN * largest, FASTEST**2 * joint_inertia(job))
 
 
 def pad_stiffness(job: Job) -> float:
-    """Return the stiffness of each arm at its pad along the normal that the gains make [N/m].
+    """Return the stiffness of each arm at its pad along the normal that follows from the gains
+    [N/m].
 
-    With compliances c_i = n' J K^-1 J' n of both arms in series it is 2 / (c_1 + c_2), the largest
-    along the job.
+    The compliances c_i = n' J K^-1 J' n of both arms act in series: the stiffness is 2 / (c_1 +
+    c_2), the largest value along the job.
     """
     gains, compliance = joint_stiffness(job), np.array([0.0])
     first = len(job.joint_names[0])
@@ -149,10 +157,11 @@ def pad_stiffness(job: Job) -> float:
 
 
 def torque_files(export: Export) -> dict[str, str | bytes]:
-    """Return the programs, the controllers, and `config/cell.json` with what the driver needs.
+    """Return the files of the target: programs, controllers, and `config/cell.json` with the
+    settings of the driver.
 
     Raises:
-        SettingsError: a torque changes faster than libfranka takes.
+        SettingsError: a torque changes faster than libfranka accepts.
     """
     driver = driver_of(export.workcell)
     if driver == "simulation":
@@ -193,7 +202,8 @@ def torque_files(export: Export) -> dict[str, str | bytes]:
 
 
 def _grip(export: Export, arm: int) -> dict[str, Any]:
-    """Return how the hands of an arm are switched, and where they tell that they hold."""
+    """Return the service calls that switch the hands of an arm on and off, and the topic on which
+    the hands report that they hold."""
     driver = export.workcell.robots[arm].driver
     io = f"/{_values(export, arm)['space']}/io_and_status_controller"
     if driver.grip_output.isdecimal():
@@ -218,11 +228,15 @@ def _controllers(
     joints: Mapping[str, int],
     broadcasters: Mapping[str, Mapping[str, Any]],
 ) -> str:
-    """Return the parameters of a controller manager and its controllers, as JSON, which is YAML.
+    """Return the parameters of a controller manager and its controllers as JSON, which is valid
+    YAML.
 
     Args:
-        joints: names in ROS by their places among both arms' joints.
-        broadcasters: parameters by the names of further controllers; `type` is the manager's.
+        export: the export.
+        driver: name of the driver.
+        joints: index among both arms' joints by the joint's name in ROS.
+        broadcasters: parameters of further controllers by name; their `type` belongs to the
+            manager.
     """
     cell = export.workcell
     rates = [robot.driver.rate for robot in cell.robots if robot.driver.rate is not None]
@@ -254,10 +268,9 @@ def _controllers(
 
 
 def joint_inertia(job: Job) -> Array:
-    """Return the mean inertia (joints,) about each joint along the job, of arm and tool alone.
-
-    Diagonal elements of the joint-space inertia matrix [kg m^2, kg].
-    """
+    """Return the mean inertia (joints,) about each joint during the job, of arm and tool without
+    the payload: diagonal elements of the joint-space inertia matrix [kg m^2, for sliding joints
+    kg]."""
     found, begin = [], 0
     for robot, joints in zip(job.workcell.robots, job.joint_names, strict=True):
         model = build_robot_model(robot).model
@@ -269,7 +282,7 @@ def joint_inertia(job: Job) -> Array:
 
 
 def _values(export: Export, arm: int) -> dict[str, Any]:
-    """Return an arm's values for the templates of all drivers."""
+    """Return the values of an arm that the templates of all drivers need."""
     robot, prefix = export.workcell.robots[arm], prefixes(export.workcell)[arm]
     mass, centre = export.tool_load(arm)
     spaces = [prefix.rstrip("_") for prefix in prefixes(export.workcell)]
@@ -289,10 +302,10 @@ def _values(export: Export, arm: int) -> dict[str, Any]:
 
 
 def _franka(export: Export, arm: int) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Return the values of an arm of Franka for its template, and its broadcasters.
+    """Return the values of a Franka arm for its template, and the parameters of its broadcasters.
 
     Raises:
-        SettingsError: a torque changes faster than libfranka takes.
+        SettingsError: a torque changes faster than libfranka accepts.
     """
     rate = np.abs(np.diff(export.effort - export.gravity, axis=0))
     rate /= np.diff(export.sampled.time)[:, None]
@@ -322,14 +335,14 @@ def _franka(export: Export, arm: int) -> tuple[dict[str, Any], dict[str, dict[st
 
 
 def _franka_type(joints: Sequence[str]) -> str:
-    """Return the TYPE of joints TYPE_joint1 ...; '' where they are called otherwise."""
+    """Return TYPE if the joints are called TYPE_joint1 to TYPE_joint7, else ''."""
     kind = joints[0].removesuffix("_joint1")
     return kind if list(joints) == [f"{kind}_joint{k}" for k in range(1, 8)] else ""
 
 
 def _contact(job: Job, arm: int) -> tuple[Array, tuple[float, float]]:
-    """Return the largest values of contact: of each joint (n_joints,) [N m], force [N] and
-    moment [N m]."""
+    """Return the largest values from the contact wrench during the job: torque of each joint
+    (n_joints,) [N m], and force [N] and moment [N m] at the pad."""
     first = len(job.joint_names[0])
     span = slice(0, first) if arm == 0 else slice(first, None)
     torque = [np.abs(p.motion.contact_effort(p.force.wrench)[:, span]).max(0) for p in job.phases]
@@ -339,7 +352,8 @@ def _contact(job: Job, arm: int) -> tuple[Array, tuple[float, float]]:
 
 
 def _ur(export: Export, arm: int) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Return the values of an arm of Universal Robots for its template, and its broadcasters."""
+    """Return the values of a Universal Robots arm for its template, and the parameters of its
+    broadcasters."""
     found = re.search(UR_TYPE, described(export.workcell.robots[arm]))
     values = _values(export, arm)
     prefix = values["prefix"]

@@ -60,13 +60,14 @@ class Draft:
         return self.waypoints[1:-1, :POSE_SIZE]
 
     def around(self, centre: Array) -> Draft:
-        """Return the draft with another decision vector as its carry."""
+        """Return the draft with the waypoints of another decision vector."""
         m = len(self.workcell.task.redundant)
         return replace(self, waypoints=_as_waypoints(centre, self.waypoints, m))
 
 
 def changes(problem: Problem, found: Draft) -> dict[str, Any]:
-    """Return the additions that complete the problem's tables."""
+    """Return the tables that complete a problem file to a workcell with a found path: the keys to
+    be added, by table."""
     poses = readable_turns(found.waypoints[:, :POSE_SIZE], found.workcell.task.orientation)
     waypoints = np.hstack([poses, found.waypoints[:, POSE_SIZE:]])
     lower, upper = _boxes(found, waypoints)
@@ -112,8 +113,9 @@ def changes(problem: Problem, found: Draft) -> dict[str, Any]:
 
 
 def decision_bounds(workcell: Workcell) -> tuple[Array, Array]:
-    """Compute half-widths (n_var,) of bounds, which share one factor, and limits (2, n_var) of
-    bounds around the workcell's hand-made trajectory."""
+    """Return half-widths (n_var,) of bounds for the decision vector, to be multiplied by one
+    common factor, and the limits (2, n_var) within which bounds around the hand-made trajectory
+    must stay."""
     task, n = workcell.task, len(workcell.task.waypoints)
     poses = [pose_limits(pose, task.orientation) for pose in task.initial]
     joints = np.repeat(joint_limits(workcell), n, axis=1)

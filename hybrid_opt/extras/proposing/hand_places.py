@@ -23,34 +23,38 @@ from symbolic.records import Contact, Workcell
 from symbolic.records.poses import inverse, pose_matrix, transform
 
 HEIGHTS = ((0.0, 0.0), (0.5, 0.0), (-0.5, 0.0), (1.0, 0.0), (-1.0, 0.0))
-"""Places on opposite faces, the same for both arms, along the face's axes over the room that a
-pattern leaves there; the first axis points upwards on upright faces."""
+"""Tried places of hands on opposite faces, the same for both arms, along both axes of the face.
+The unit is the free distance between hands and edges; the first axis points upwards on upright
+faces."""
 
 BESIDE = tuple(k * np.array(way) for way in ((1, 0), (-1, 0), (0, 1), (0, -1)) for k in (1.0, 0.5))
-"""Places of the first arm's hands on one face, at its edges and halfway; the other arm's are
-opposite."""
+"""Tried places of the first arm's hands if both arms' hands share a face: at the edges and halfway
+to them. The other arm's hands are placed opposite."""
 
 EDGE = 0.005
-"""Distance of patches from the edges of their face [m]."""
+"""Least distance of a patch from the edges of its face [m]."""
 
 DOWNWARDS = -0.7
-"""Upward share of a face's outward normal below which no hand gets there."""
+"""Vertical component of a face's outward normal below which no hand can reach the face."""
 
 MOST_PLACES = 16
-"""Places of both arms' hands that are kept."""
+"""Largest number of places of both arms' hands that are returned."""
 
 Both = tuple[Contact, Contact]
 
 Entry = dict[str, Any]
-"""The keys `xyz`, `spin`, `normal` and `further` of `[[contacts]]`."""
+"""The keys `xyz`, `spin`, `normal` and `further` of an entry of `[[contacts]]`."""
 
 
 def pattern_entry(entry: Entry, thickness: float) -> Entry:
-    """Return a contact's entry with its hands in the axes of the first one, z into the payload.
+    """Return the entry of a contact whose hands are placed relative to the first hand: at the
+    origin, with z into the payload.
 
     Args:
-        entry: without `xyz`; the `xyz` of its `further` hands are in these axes.
-        thickness: of the payload, for the opposite finger of a gripper without `further` [m].
+        entry: entry without `xyz`; the `xyz` of its `further` hands are already relative to the
+            first hand.
+        thickness: thickness of the payload, for the opposite finger of a gripper without `further`
+            [m].
     """
     further = entry.get("further", [])
     if entry.get("kind") == "fingers" and not further:
@@ -62,7 +66,8 @@ def pattern_entry(entry: Entry, thickness: float) -> Entry:
 
 
 def place_entry(contact: Contact, with_normals: bool = False) -> Entry:
-    """Return the keys that say where an arm's hands or pads are."""
+    """Return the keys of a contact's entry that place its hands or pads: `xyz`, `spin`, `further`,
+    and `normal` if wanted."""
     entries: list[Entry] = []
     for pad in (contact, *contact.further):
         R = pad.T_box_pad[:3, :3]
@@ -80,15 +85,17 @@ def hand_places(
     along: Array,
     workcell: Callable[[list[Entry]], Workcell],
 ) -> list[list[Entry]]:
-    """Return places of both arms' hands, those first that require the least share of their holding
-    force; none where the arms would cross.
+    """Return places of both arms' hands on a box, those first that need the least share of the
+    hands' holding force with the payload at rest. Places at which the arms would cross are left
+    out.
 
     Args:
-        patterns: both arms' hands in the axes of the first one, see `pattern_entry`.
+        patterns: contact of each arm, with its hands placed relative to the first one as by
+            `pattern_entry`.
         size: (3,) edges of the box [m].
         rotations: (n, 3, 3) R_world_box at the ends of the carry.
-        along: (3,) from robot 2 to robot 1, box frame; zeros if unknown.
-        workcell: reads the cell with these keys of both contacts.
+        along: (3,) vector from robot 2 to robot 1 in the box frame; zeros if unknown.
+        workcell: function that reads the cell with the given entries of both contacts.
     """
     pairs = [
         (first, second)
@@ -109,7 +116,7 @@ def hand_places(
 
 
 def _with_tools_outside(cell: Workcell, pairs: Sequence[Both]) -> Iterator[Both]:
-    """Yield those of both arms' hands whose tools do not enter the payload."""
+    """Yield the pairs of contacts with which no tool enters the payload."""
     bodies, arms = collision_bodies(cell), [arm_geometry(cell, arm) for arm in (0, 1)]
     T_joint_pad = [
         arm.T_joint_box @ contact.T_box_pad
@@ -124,8 +131,9 @@ def _with_tools_outside(cell: Workcell, pairs: Sequence[Both]) -> Iterator[Both]
 
 
 def _pairs(patterns: Sequence[Contact], size: Array, rotations: Array) -> Iterator[Both]:
-    """Yield both arms' hands on faces that are free at both ends of the carry: cups and magnets on
-    opposite faces or on one, fingers at the edges of the thinnest side."""
+    """Yield pairs of contacts of both arms on faces that are free at both ends of the carry. Cups
+    and magnets are placed on opposite faces or on one face, fingers around the edges of the
+    thinnest side."""
     quarters = np.pi / 2.0 * np.arange(4)
     turned = [rotate_about_normal(pattern, quarters[1]) for pattern in patterns]
     is_same = all(map(covers_the_same, patterns, turned))
@@ -153,7 +161,16 @@ def _pairs(patterns: Sequence[Contact], size: Array, rotations: Array) -> Iterat
 def _placed(
     pattern: Contact, outward: Array, size: Array, turn: float, place: Array
 ) -> Contact | None:
-    """Return a pattern on a face of a box of edges (3,), None if it has no room there."""
+    """Return a contact with its hands on a face of a box, None if the face has too little room.
+
+    Args:
+        pattern: contact with its hands placed relative to the first one.
+        outward: (3,) outward normal of the face.
+        size: (3,) edges of the box [m].
+        turn: rotation of the hands about the face's normal [rad].
+        place: (2,) displacement from the centre of the face along the face's axes, over the free
+            distance to the edges.
+    """
     face = pad_rotation(-outward, 0.0)
     rotation = face @ pose_matrix(np.zeros(3), np.array([0.0, 0.0, turn]))[:3, :3]
     reach = np.array([_reach(pad) for pad in (pattern, *pattern.further)])
@@ -168,7 +185,7 @@ def _placed(
 
 
 def _reach(pad: Contact) -> Array:
-    """Return half the extent (2,) of a patch along the axes of its pattern [m]."""
+    """Return half the extent (2,) of a pad's patch along the axes of its contact [m]."""
     if pad.half_sides is None:
         return np.full(2, pad.patch_radius)
     return np.asarray(np.abs(pad.T_box_pad[:2, :2]) @ pad.half_sides)
@@ -179,7 +196,7 @@ def _points(contact: Contact) -> Array:
 
 
 def _overlap(one: Contact, other: Contact) -> bool:
-    """Return True if circles around the patches of both arms meet."""
+    """Return True if circles around the patches of two contacts intersect."""
     apart = np.linalg.norm(_points(one)[:, None] - _points(other), axis=2)
     return bool(apart.min() < one.patch_radius + other.patch_radius)
 

@@ -34,18 +34,20 @@ GUIDE_POSES = 25
 
 
 def possible_spins(contact: Contact, spins: Array) -> Array:
-    """Return those of spins (n,) [rad] that leave a robot's patches unchanged: all of one round
-    pad, half turns of a rectangular one, quarter turns of a square array of cups."""
+    """Return those of spins (n,) [rad] with which the rotated pads of an arm cover the same patches
+    as before: every spin of one round pad, half turns of a rectangular pad, quarter turns of a
+    square array of cups."""
     same = [covers_the_same(contact, rotate_about_normal(contact, float(spin))) for spin in spins]
     return np.asarray(spins[same])
 
 
 def clear_spins(query: HoldQuery, kinematics: ArmKinematics, spins: Array) -> Array:
-    """Return those of spins (n,) [rad] at which the bodies fixed to the arm's last joint, hand,
-    tool and pad, do not enter the payload and meet nothing that stands, at the start and at the
-    goal; all of them if none is free.
+    """Return those of spins (n,) [rad] with which hand, tool and pad, the bodies fixed to the arm's
+    last joint, neither enter the payload nor collide with fixed bodies, at the start and at the
+    goal. All spins are returned if none is clear.
 
-    Within a shelf that is a few of twelve, on which all random starts are spent then.
+    Within a shelf only a few of twelve spins are clear, and all random starts are then spent on
+    these.
     """
     if query.judge is None:
         return spins
@@ -262,8 +264,8 @@ class _Finder:
         return q[kept], which[kept]
 
     def colliding(self, pose: Array, q: Array) -> NDArray[np.bool_]:
-        """Return (n,) True for postures (n, joints) that collide while they hold the box at a pose.
-        Collisions are counted by pair."""
+        """Return a mask (n,) that is True for postures (n, joints) that collide while they hold the
+        box at a pose. Collisions are counted by pair."""
         judge, arm = self.query.judge, self.kinematics.arm
         if judge is None or not len(q):
             return np.zeros(len(q), dtype=bool)

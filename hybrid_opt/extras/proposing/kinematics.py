@@ -96,7 +96,8 @@ class ArmKinematics:
 
     @property
     def span(self) -> Array:
-        """(2, joints) joint limits, clipped to half a turn in both directions [rad or m]."""
+        """(2, joints) lower and upper joint limits, clipped to plus and minus half a turn [rad or
+        m]."""
         return np.array([np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)])
 
     def drawn(self, count: int, rng: np.random.Generator) -> Array:
@@ -243,8 +244,8 @@ class ArmKinematics:
 
 
 def rotate_about_normal(contact: Contact, spin: float) -> Contact:
-    """Return a contact with its pad turned about its normal by an angle [rad]; further pads turn
-    with it, all about their middle."""
+    """Return a contact with its pad rotated about its normal by an angle [rad]. If the contact has
+    several pads, they rotate together about their middle."""
     turn = pose_matrix(np.zeros(3), np.array([0.0, 0.0, spin]))
     if not contact.further:
         return replace(contact, T_box_pad=contact.T_box_pad @ turn)
@@ -260,7 +261,8 @@ def moved(contact: Contact, motion: Array) -> Contact:
 
 
 def covers_the_same(contact: Contact, other: Contact) -> bool:
-    """Return True if pads of the same kind cover the same patches, in any order."""
+    """Return True if two contacts have pads of the same kind that cover the same patches, in any
+    order."""
 
     def alike(a: Contact, b: Contact) -> bool:
         apart = np.abs(a.T_box_pad[:3, 2:] - b.T_box_pad[:3, 2:]).max()
@@ -272,8 +274,8 @@ def covers_the_same(contact: Contact, other: Contact) -> bool:
 
 
 def shoulder_positions(robots: tuple[Robot, Robot]) -> Array:
-    """Compute the positions (2, 3) of each arm's first own joint in the world, all joints at the
-    middle of their ranges [m]."""
+    """Return the position (2, 3) of the first joint that moves only one arm, for each arm in the
+    world [m], with all joints at the middle of their ranges."""
     found = []
     for robot in robots:
         model = arm_model(robot)
@@ -296,15 +298,15 @@ def has_wrist_spin(kinematics: ArmKinematics) -> bool:
 
 
 def _turns(axis: Array, angle: Array) -> Array:
-    """Compute rotations (n, 3, 3) by angles (n,) about a unit axis (3,), by Rodrigues' formula."""
+    """Compute rotation matrices (n, 3, 3) for angles (n,) about a unit axis (3,)."""
     K = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
     sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
     return np.asarray(np.eye(3) + sine * K + (1.0 - cosine) * (K @ K))
 
 
 def _error(target: Array, T: Array) -> tuple[Array, Array]:
-    """Compute Newton's right-hand side (n, 6) and the pose residual (n,) of placements T (n, 4,
-    4)."""
+    """Return the pose errors (n, 6) of placements T (n, 4, 4), the right-hand side of Newton's
+    equations, and their residuals (n,) [m, rad]."""
     R, R_target = T[:, :3, :3], target[:, :3, :3]
     dR = R_target @ R.transpose(0, 2, 1)
     axis = np.stack(

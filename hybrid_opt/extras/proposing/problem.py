@@ -44,12 +44,12 @@ DRAFT_ROOM = 0.01
 
 @dataclass(frozen=True)
 class Problem:
-    """A problem file.
+    """The content of a problem file, without the keys that are to be proposed.
 
     Attributes:
         source: path of the file.
-        text: text of the file, without the keys to propose.
-        data: tables of the file, without the keys to propose.
+        text: text of the file without these keys.
+        data: tables of the file without these keys.
     """
 
     source: Path
@@ -85,14 +85,14 @@ class Problem:
 
     @cached_property
     def contacts(self) -> list[dict[str, Any]]:
-        """Both contacts' points, the middles of opposite faces where the file has none: those that
-        face the robots (the shoulders of a machine with both arms), or those that the carry passes
-        sideways where the robots have no bases. Of hands that hold by themselves the best of
-        `hand_places`.
+        """Entries of both contacts with their points on the box: as in the file if it states any.
+        For hands that hold by themselves, the best of `hand_places`. Else the centres of the
+        opposite faces that face the robots, or the shoulders of a machine with two arms; without
+        bases in the file, the faces lateral to the carry.
 
         Raises:
-            WorkcellError: shoulders are needed, and the robots are wrong; or hands have no room on
-                any face.
+            WorkcellError: the file describes robots whose shoulders cannot be found, or no face has
+                room for the hands.
         """
         entries = self.data["contacts"]
         if all("xyz" in entry for entry in entries):
@@ -108,8 +108,8 @@ class Problem:
 
     @cached_property
     def _bases(self) -> Array | None:
-        """Positions (2, 3) of the robots' bases, of a machine those of its shoulders; None if the
-        file has none [m]."""
+        """(2, 3) positions of the robots' bases, or of the shoulders of a machine with two arms, in
+        the world [m]; None if the file has no bases."""
         found = [robot.get("base", {}).get("xyz") for robot in self.data["robots"]]
         if not all(isinstance(xyz, list) and len(xyz) == 3 for xyz in found):
             return None
@@ -124,7 +124,8 @@ class Problem:
 
     @cached_property
     def _hand_places(self) -> list[list[dict[str, Any]]]:
-        """Places of both arms' hands, the best first."""
+        """Entries of both contacts for all places of the arms' hands that are considered, the best
+        first."""
         size = np.array(self.data["payload"]["size"], dtype=float)
         thickness, problems = float(size.min()), Problems()
         entries = [pattern_entry(entry, thickness) for entry in self.data["contacts"]]
@@ -150,9 +151,9 @@ class Problem:
         return found
 
     def other_contacts(self) -> list[list[dict[str, Any]]]:
-        """Return the other pairs of faces that the pads may press, both ways round, the most
-        promising first: upright faces, then those that face the robots. None if the file names
-        points or has no bases."""
+        """Return entries of both contacts for the other places that the pads or hands may take, the
+        most promising first. For pads these are all pairs of opposite faces, upright faces first,
+        then those that face the robots. Empty if the file states the points or has no bases."""
         if self._bases is None or all("xyz" in entry for entry in self.data["contacts"]):
             return []
         if self.has_hands:
@@ -169,7 +170,7 @@ class Problem:
         return [pair for pair in pairs if pair != self.contacts]
 
     def _robots(self) -> tuple[Robot, Robot]:
-        """Read the robots alone, wherever the box is."""
+        """Read the robots without the rest of the file."""
         problems = Problems()
         entries = TableReader(self.data, "", problems).tables("robots", exactly=2)
         found = [read_robot(entry, self.source.parent)[0] for entry in entries]
@@ -178,9 +179,9 @@ class Problem:
         return found[0], found[1]
 
     def sides(self) -> list[Problem]:
-        """Return the problem with each pair of upright faces that the pads may press if its robots
-        have no bases yet, a machine's arms either way round; itself alone if the file names the
-        points, or a level carry past two robots leaves no choice."""
+        """Return copies of the problem with the pads on each pair of upright faces; on a machine
+        each pair twice, with exchanged arms. Only the problem itself if the file states the points,
+        or if a level carry past two robots determines the faces."""
         entries = self.data["contacts"]
         start, goal = self.poses
         level = float(np.linalg.norm((goal - start)[:2]))
@@ -268,7 +269,8 @@ def read_problem(path: str | Path) -> Problem:
 
 
 def _require_known(table: TableReader) -> None:
-    """Report missing keys that a proposal needs; the reader of workcell files checks the rest."""
+    """Report keys that a proposal needs and that are missing or wrong. All other keys are checked
+    when the workcell is read."""
     task, payload = table.table("task"), table.table("payload")
     _, contacts = (table.tables(key, exactly=2) for key in ("robots", "contacts"))
     if table.problems.found:

@@ -176,16 +176,18 @@ def prepare(
     rng: np.random.Generator,
     tell: Callable[[str], None] = lambda text: None,
 ) -> Setup:
-    """Find all holds of both arms.
+    """Find all holds of both arms, and the pairs of holds in which the arms do not collide.
 
     Args:
-        given: added to the problem's tables.
-        spins: of both pads that are tried [rad].
-        tell: called with the budget of the grip, before any search.
+        problem: the problem.
+        given: additions to the problem's tables, such as bases.
+        spins: (n,) rotations of the pads about their normals that are tried [rad].
+        rng: random generator.
+        tell: function that is called with the text of the grip budget before the search.
 
     Raises:
-        ProposalError: an arm cannot hold the box at start and goal; the text says why.
-        WorkcellError: the problem is wrong, or no arms could hold the payload still.
+        ProposalError: an arm cannot hold the box at start and goal; the message says why.
+        WorkcellError: the problem is wrong, or the payload cannot be held at rest.
     """
     start, goal = problem.poses
     given = merged(given, redundancy(problem, problem.workcell(given)))
@@ -217,13 +219,13 @@ def prepare(
 
 
 def _progress(searches: Sequence[HoldSearch]) -> tuple[float, ...]:
-    """Return a sort key of the searches of both arms: how far the less successful arm gets."""
+    """Return a key to compare searches for holds by: how far the less successful arm got."""
     return min((len(one.holds), one.kept, one.free, one.within) for one in searches)
 
 
 def redundancy(problem: Problem, workcell: Workcell) -> dict[str, Any]:
-    """Return changes that make the joints beyond six that the file does not name redundant, at the
-    middle of their ranges."""
+    """Return the table entries that declare joints redundant: those of arms with more than six
+    joints, except joints that the file names. They start at the middle of their ranges."""
     robots: list[dict[str, Any]] = [{}, {}]
     entries: dict[str, dict[str, Any]] = {}
     common = common_joints(workcell.robots)
@@ -245,8 +247,9 @@ def redundancy(problem: Problem, workcell: Workcell) -> dict[str, Any]:
 
 
 def redundant_joints(workcell: Workcell, arm: int, common: tuple[str, ...]) -> tuple[int, ...]:
-    """Return the indices of those joints of an arm without which the other six are conditioned
-    best, in the median of random postures. Common and sliding joints are always among them."""
+    """Return the indices of the joints of an arm that should be redundant: the choice with which
+    the other six joints are best conditioned, in the median of random postures. Joints that move
+    both arms and sliding joints are always included."""
     robot = workcell.robots[arm]
     model = arm_model(robot)
     names, beyond = list(model.names)[1:], model.nq - FOLLOWING
@@ -278,8 +281,14 @@ def box_blocked(judge: PoseJudge, start: Array, goal: Array) -> str:
 
 
 def reach_missing(workcell: Workcell, ends: tuple[Array, Array], spins: Array) -> str:
-    """Return a text on an arm that reaches its contact at the start or the goal (6,) with no spin,
-    and on the missing distance; '' if both arms reach."""
+    """Return a text that says which arm cannot reach its contact, at which end, and by which
+    distance; '' if both arms reach with some spin.
+
+    Args:
+        workcell: the cell.
+        ends: start and goal pose (6,) of the box [m, rad].
+        spins: (n,) rotations of the pads about their normals that are tried [rad].
+    """
     found = []
     for arm, (name, pose) in product((0, 1), zip(("start", "goal"), ends, strict=True)):
         robot, contact = workcell.robots[arm], workcell.contacts[arm]
