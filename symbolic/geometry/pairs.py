@@ -64,7 +64,7 @@ class ActivePair:
 
 @dataclass(frozen=True)
 class ExcludedPair:
-    """Names of two bodies that are not checked, and the reason."""
+    """Indices of two bodies whose distance is not checked, and the reason."""
 
     first: int
     second: int

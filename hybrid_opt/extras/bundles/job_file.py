@@ -50,26 +50,27 @@ from symbolic.robot.model import build_robot_model
 Interpolation = Literal["linear", "cubic", "quintic"]
 
 DERIVATIVES: Mapping[Interpolation, int] = {"linear": 1, "cubic": 2, "quintic": 3}
-"""Derivatives that each takes of a sample: position, also velocity, also acceleration."""
+"""Number of values that each kind of interpolation takes from a sample: position; also velocity;
+also acceleration."""
 
 BETWEEN = (0.25, 0.5, 0.75)
-"""Shares of a step at which the pads are looked at."""
+"""Shares of a time step at which the error of the pads between two samples is computed."""
 
 MOST_INTERVALS = 1500
-"""Steps that are looked at, evenly spread."""
+"""Largest number of time steps for which this error is computed, evenly spread over the job."""
 
 
 @dataclass(frozen=True)
 class Gap:
-    """Effect of a time step on the pads while they hold the box.
+    """Error of the pads between two samples of a job while they hold the box.
 
     Attributes:
-        step: [s].
-        interpolation: between two samples.
+        step: longest time between two samples [s].
+        interpolation: kind of interpolation between two samples.
         along: largest change of the distance between the pads along the normal [m].
-        across: largest displacement of one against the other across it [m].
-        force: error of the normal forces that the change along the normal makes [N].
-        share: the same, of the least commanded normal force.
+        across: largest displacement of one pad against the other across the normal [m].
+        force: error of the normal forces from the change along the normal [N].
+        share: this error over the least commanded normal force.
     """
 
     step: float
@@ -83,14 +84,17 @@ class Gap:
 def chosen_step(
     job: Job, steps: Sequence[float], interpolation: Interpolation, stiffness: float
 ) -> float:
-    """Return the longest of the steps whose force error stays within the tracking share.
+    """Return the longest time step with which the error of the normal forces stays within the
+    tracking share.
 
     Args:
-        steps: that the target can have, the longest first [s].
-        stiffness: of each arm at its pad [N/m].
+        job: the job.
+        steps: time steps that the target supports, the longest first [s].
+        interpolation: kind of interpolation between two samples.
+        stiffness: stiffness of each arm at its pad [N/m].
 
     Raises:
-        SettingsError: none does.
+        SettingsError: the error is too large with every step.
     """
     for step in steps:
         found = gap_of(sample_job(job, step), interpolation, stiffness)
@@ -106,10 +110,12 @@ def chosen_step(
 
 
 def gap_of(sampled: SampledJob, interpolation: Interpolation, stiffness: float) -> Gap:
-    """Compute the error of the pads between the samples of a job under an interpolation.
+    """Compute the error of the pads between the samples of a job.
 
     Args:
-        stiffness: of each arm at its pad [N/m].
+        sampled: the job at given time steps.
+        interpolation: kind of interpolation between two samples.
+        stiffness: stiffness of each arm at its pad [N/m].
     """
     job, time = sampled.job, sampled.time
     spans = [sampled.span(job.phases.index(phase)) for phase in job.held]
@@ -133,27 +139,29 @@ def gap_of(sampled: SampledJob, interpolation: Interpolation, stiffness: float) 
 
 
 def between(time: Array, known: Sequence[Array], interpolation: Interpolation) -> BPoly:
-    """Interpolate joints between samples as a controller does: the polynomial of least degree
-    through the known values at both ends.
+    """Interpolate joint positions between samples as a controller does, by the polynomial of least
+    degree through the known values at both ends of a step.
 
     Args:
-        time: (n,) ascending [s].
-        known: (n, joints) each: positions, then velocities and accelerations as far as the
-            interpolation takes them [rad, m, s].
+        time: (n,) ascending times [s].
+        known: arrays (n, joints) of positions, then of velocities and accelerations as far as the
+            interpolation uses them [rad or m, and s].
+        interpolation: kind of interpolation.
     """
     taken = np.stack(known[: DERIVATIVES[interpolation]], axis=1)
     return BPoly.from_derivatives(time, taken)
 
 
 def pad_errors(workcell: Workcell, q: Array) -> tuple[Array, Array]:
-    """Compute the error of the pads' relative pose in postures.
+    """Compute the error of the relative pose of both pads.
 
     Args:
-        q: (n, joints) both arms side by side [rad].
+        workcell: the cell.
+        q: (n, joints) joint positions of both arms side by side [rad].
 
     Returns:
-        (n,) the distance between the pads along the first one's normal less the planned one [m],
-        and (n,) their displacement across it [m].
+        (n,) distance between the pads along the first pad's normal minus the planned distance [m],
+        and (n,) displacement across this normal [m].
     """
     first = len(workcell.robots[0].torque_max)
     T = [pad_places(workcell, arm, own) for arm, own in enumerate((q[:, :first], q[:, first:]))]
@@ -164,7 +172,8 @@ def pad_errors(workcell: Workcell, q: Array) -> tuple[Array, Array]:
 
 
 def pad_places(workcell: Workcell, arm: int, q: Array) -> Array:
-    """Compute the poses (n, 4, 4) of an arm's pad in the world, at its joints (n, joints) [rad]."""
+    """Compute the poses (n, 4, 4) of an arm's pad in the world for joint positions (n, joints) of
+    the arm [rad]."""
     robot = workcell.robots[arm]
     model = build_robot_model(robot)
     data, found = model.model.createData(), np.empty((len(q), 4, 4))
@@ -175,8 +184,8 @@ def pad_places(workcell: Workcell, arm: int, q: Array) -> Array:
 
 
 def pad_jacobians(workcell: Workcell, arm: int, q: Array) -> Array:
-    """Compute the Jacobian (n, 6, n_joints) of an arm's pad, along the flange's axes, at its joints
-    (n, n_joints) [m/rad, 1]."""
+    """Compute the Jacobians (n, 6, n_joints) of an arm's pad along the flange's axes for joint
+    positions (n, n_joints) of the arm [m/rad, 1]."""
     robot, found = workcell.robots[arm], np.empty((len(q), 6, q.shape[1]))
     model = build_robot_model(robot)
     data = model.model.createData()
@@ -188,30 +197,31 @@ def pad_jacobians(workcell: Workcell, arm: int, q: Array) -> Array:
 
 
 STOP_TIMES = (0.1, 0.15, 0.2, 0.3, 0.45, 0.7, 1.0, 1.5, 2.0, 3.0)
-"""Times of a stop that are tried, the shortest first [s]."""
+"""Durations of a stop along the path that are tried, the shortest first [s]."""
 
 STOP_STRIDE = 5
-"""Stride of the job's own samples at which a stop is tried."""
+"""A stop is tried at every sample of the job with this stride."""
 
 INSTANTS = 9
-"""Instants at which a stop is looked at."""
+"""Number of instants during a stop at which forces and accelerations are computed."""
 
 JOINT_USE = 1.1
-"""Joint acceleration of a stop over its limit, if it can be had: timings use the limits whole."""
+"""Largest joint acceleration of a stop over its limit, if a stop with so little exists. It exceeds
+1 because timings use the limits fully."""
 
 _model = cache_by_workcell(TimingModel)
 
 
 @dataclass(frozen=True)
 class Stop:
-    """How a job stops along its path.
+    """A stop of both arms along the path of a job.
 
     Attributes:
         time: from the planned speed to rest [s].
-        force_use: largest normal force that holds the box in a stop, over the commanded one.
-        joint_use: largest joint acceleration of a stop over its limit.
-        quick: the shortest time that the commanded forces bear, joint limits ignored, for arms that
-            no longer move together [s].
+        force_use: largest normal force that holds the box in such a stop, over the commanded force.
+        joint_use: largest joint acceleration in such a stop, over its limit.
+        quick: shortest time of a stop that the commanded forces allow if joint limits are ignored
+            [s]. It is used if the arms no longer move together.
     """
 
     time: float
@@ -221,10 +231,10 @@ class Stop:
 
 
 def stop_of(job: Job) -> Stop:
-    """Find the shortest stop along the path that the commanded forces bear.
+    """Find the shortest stop along the path that the commanded forces allow everywhere in a job.
 
     Raises:
-        JobError: none does.
+        JobError: they allow none.
     """
     model, motions = _model(job.workcell), [phase.motion for phase in job.phases]
     time = np.concatenate([phase.begin + phase.motion.time for phase in job.phases])
@@ -240,7 +250,7 @@ def stop_of(job: Job) -> Stop:
     places, x = time[::STOP_STRIDE], np.linspace(0.0, 1.0, INSTANTS)
 
     def stop(duration: float) -> Stop:
-        """Compute a stop of a duration [s], tried all along the path."""
+        """Compute the stop of this duration [s], tried at all places of the path."""
         rate = 1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
         slope = -30.0 * x**2 * (1.0 - x) ** 2 / duration
         passed = duration * (x - 2.5 * x**4 + 3.0 * x**5 - x**6)
@@ -273,17 +283,19 @@ def stop_of(job: Job) -> Stop:
 
 
 START, PATH = 0.005, 0.02
-"""Largest distance of a pad from its first place and from its path [m]."""
+"""Largest distance of a pad from its first position, and from its path [m]."""
 
 BEHIND, LAGS = 0.05, 3.0
-"""How far an arm may lag behind its reference [s]; at least this multiple of its usual lag."""
+"""Largest time that an arm may lag behind its reference [s], and the least multiple of its usual
+lag for this time."""
 
 LEAST_SKEW, MOST_SKEW = 0.008, 0.05
-"""Range of the distance of both arms along the path that a program watches for [s]: less cannot be
-told from measured postures."""
+"""Range of the difference between both arms along the path above which a program stops the job [s].
+Less could not be detected from measured postures."""
 
 LEAST_BAND, MOST_BAND = 0.05, 0.3
-"""Range of the share by which a measured force may miss its reference."""
+"""Range of the largest deviation of a measured force from its reference, as a share of the
+reference."""
 
 REACTION = 0.07
 """From the look at which an arm is wrong to when the other one leaves its course [s]: two looks
@@ -291,7 +303,7 @@ more, and the time of a message (`STRIKES` of carry_machine.py, `PERIOD` and `LE
 run_job.py)."""
 
 SILENCE = 0.1
-"""Longest time without news from an arm [s]."""
+"""Longest time without a message from an arm [s]."""
 
 
 @dataclass(frozen=True)
@@ -321,7 +333,7 @@ class PartnerStop:
 
     @property
     def warning(self) -> str:
-        """Say what keeps a box that such a stop may lose; '' where friction holds it."""
+        """A remedy if friction may lose the box in such a stop; '' if friction holds it."""
         if self.survived is None or self.distance <= self.survived:
             return ""
         return (
@@ -337,17 +349,18 @@ Contents = Mapping[str, str | bytes]
 
 @dataclass(frozen=True)
 class BundleOptions:
-    """How a job is written.
+    """Options of a bundle.
 
     Attributes:
-        step: time between samples [s]; None for the longest that keeps the forces.
-        any_arm: write a maker's own language for arms that do not look like that maker's.
-        stiffness: of each arm at its pad along the normal [N/m]; None for that of the cell's
-            drivers, or of the gains where the target has gains.
-        skew: between the starts of both arms that the job has to survive [s]; None for what the
-            target leaves to chance.
-        addresses: host names or IP addresses of both controllers, in place of those of the
-            workcell; None for those.
+        step: time between samples [s]; None for the longest with which the error of the forces is
+            small enough.
+        any_arm: whether a maker's own language is also written for arms that do not look like this
+            maker's.
+        stiffness: stiffness of each arm at its pad along the normal [N/m]; None for the drivers'
+            value in the workcell, or the value that follows from the target's gains.
+        skew: time between the starts of both arms that the job has to survive [s]; None for the
+            usual time of the target.
+        addresses: host names or IP addresses of both controllers; None for those in the workcell.
     """
 
     step: float | None = None
@@ -365,13 +378,14 @@ class BundleOptions:
 
 @dataclass(frozen=True, eq=False)
 class Export:
-    """A job on its way into a bundle.
+    """A job with all data from which the files of a bundle are written.
 
     Attributes:
         sampled: the job at the target's time steps.
-        stiffness: of each arm at its pad along the normal [N/m]; None if nothing depends on it.
-        gap: effect of the time steps on the pads; None without a stiffness.
-        stop: how it stops along the path.
+        stiffness: stiffness of each arm at its pad along the normal [N/m]; None if nothing depends
+            on it.
+        gap: error of the pads between samples; None without a stiffness.
+        stop: the stop of the job along its path.
     """
 
     sampled: SampledJob
@@ -391,7 +405,7 @@ class Export:
 
     @property
     def follower(self) -> int:
-        """Index of the force-controlled arm where pads press."""
+        """Index of the force-controlled arm, for pads that press."""
         return 1 - self.job.squeeze.leader
 
     @property
@@ -401,12 +415,13 @@ class Export:
 
     @property
     def step(self) -> float:
-        """The longest time between two samples [s]."""
+        """Longest time between two samples [s]."""
         return float(np.diff(self.sampled.time).max())
 
     @cached_property
     def gravity(self) -> Array:
-        """Torques (n, joints) that balance the weight of the arms and their tools [N m, N]."""
+        """(n, joints) torques that balance the weight of the arms and their tools [N m, for sliding
+        joints N]."""
         found = []
         for arm, robot in enumerate(self.workcell.robots):
             numeric = build_robot_model(robot).model
@@ -416,7 +431,8 @@ class Export:
 
     @cached_property
     def holding(self) -> Array:
-        """Torques (n, joints) at rest with the commanded forces, gravity included [N m, N]."""
+        """(n, joints) torques at rest with the commanded forces, gravity included [N m, for sliding
+        joints N]."""
         sampled, model = self.sampled, _model(self.workcell)
         wrench = sampled.wrench.copy()
         for phase in self.job.held:
@@ -433,20 +449,21 @@ class Export:
 
     @cached_property
     def effort(self) -> Array:
-        """Torques (n, joints) of the motion with the commanded forces, gravity included; those of a
-        joint that moves both arms balance the contacts of both [N m, N]."""
+        """(n, joints) torques of the motion with the commanded forces, gravity included [N m, for
+        sliding joints N]. For a joint that moves both arms they balance the contacts of both."""
         return self.sampled.effort + self._of_other(self._contact(self.sampled.wrench))
 
     def _contact(self, wrench: Array) -> Array:
-        """Compute the joint torques (n, joints) that exert wrenches (n, 2, 6), each arm its own
-        [N m, N]."""
+        """Compute the joint torques (n, joints) with which each arm exerts its wrench, for wrenches
+        (n, 2, 6) [N m, for sliding joints N]."""
         sampled, model = self.sampled, _model(self.workcell)
         matrices = model.wrench_torque(np.ascontiguousarray(sampled.q), sampled.pose)
         first = len(self.job.joint_names[0])
         return contact_torque(first, matrices, np.swapaxes(wrench, 0, 1))
 
     def _of_other(self, contact: Array) -> Array:
-        """Return the other arm's torques (n, joints) in joints that move both arms."""
+        """Return, for joints that move both arms, the torque (n, joints) that the other arm's
+        contact causes in the joint; zero for other joints."""
         found, (own, other) = np.zeros_like(contact), self.job.joint_names
         for name in common_joints(self.workcell.robots):
             both = [own.index(name), len(own) + other.index(name)]
@@ -455,7 +472,8 @@ class Export:
 
     @property
     def joint_columns(self) -> dict[str, Array]:
-        """Joint quantities (n, joints) by name: positions, their derivatives, efforts."""
+        """Arrays (n, joints) by name: joint positions, velocities, accelerations, and torques with
+        and without gravity."""
         sampled = self.sampled
         return {
             "position": sampled.q,
@@ -467,7 +485,7 @@ class Export:
 
     @cached_property
     def gripped(self) -> Array:
-        """(n,) 1 where the outputs of hands are on, else 0."""
+        """(n,) 1 at samples at which the outputs of hands are on, else 0."""
         found = np.zeros(len(self.sampled.time))
         for index, phase in enumerate(self.job.phases):
             if phase.name in SWITCHES:
@@ -516,8 +534,8 @@ class Export:
         return found
 
     def reach(self, arm: int) -> Array:
-        """Compute the largest motion (n_joints,) of an arm's pad per motion of each joint at any
-        sample [m]."""
+        """Return for each joint (n_joints,) the largest motion of an arm's pad per unit of joint
+        motion at any sample [m/rad or 1]."""
         J = pad_jacobians(self.workcell, arm, self.sampled.arm(arm, self.sampled.q))
         return np.asarray(np.linalg.norm(J[:, :3], axis=1).max(axis=0))
 
@@ -581,18 +599,21 @@ def job_text(export: Export) -> str:
 
 
 SHARED = ("bring_up.py", "carry_job.py", "carry_machine.py")
-"""Programs of every bundle whose arms a program supervises."""
+"""Programs in every bundle whose arms are supervised by a program."""
 
 
 def plan_of(
     export: Export, target: str, program: str, leads: Sequence[float], presses: bool
 ) -> dict[str, Any]:
-    """Return the numbers of the drivers that a bundle was planned for, to be compared with those
-    that its bring-up measures.
+    """Return the values of the drivers that a bundle was planned for. The bundle's bring-up program
+    compares them with the values that it measures.
 
     Args:
+        export: the job.
+        target: name of the target.
+        program: name of the program that runs the job.
         leads: compensated part of each arm's lag [s].
-        presses: a sensor measures how hard a block is pressed.
+        presses: whether a sensor measures how strongly a block is pressed.
     """
     return {
         "target": target,
@@ -608,5 +629,6 @@ def plan_of(
 
 
 def programs(export: Export, name: str) -> dict[str, str | bytes]:
-    """Return a job with the program of a name that runs it, and those that this one imports."""
+    """Return the contents of job.json, of the program `name` that runs the job, and of the programs
+    that this one imports, by path."""
     return {"job.json": job_text(export), **{each: program(each) for each in (name, *SHARED)}}
