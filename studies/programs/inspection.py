@@ -201,6 +201,7 @@ def _meshes(workcell: Workcell) -> ProgramResult:
     sizes = {
         path.name: {
             "parts": mesh.parts,
+            "open_parts": mesh.open_parts,
             "vertices": mesh.vertices,
             "pieces": len(mesh.hulls),
             "corners": sum(len(hull.vertices) for hull in mesh.hulls),
@@ -210,6 +211,7 @@ def _meshes(workcell: Workcell) -> ProgramResult:
     lines = [
         f"  {name}: {size['vertices']} vertices in {size['parts']} part(s) became "
         f"{size['corners']} in {size['pieces']} convex piece(s)"
+        + (f"; {size['open_parts']} part(s) with holes became hulls" if size["open_parts"] else "")
         for name, size in sizes.items()
     ]
     return ProgramResult({"meshes": sizes}, ("", "Meshes:", *lines) if lines else ())

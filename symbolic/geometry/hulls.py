@@ -3,8 +3,9 @@
 A watertight component is cut by planes where that makes the hulls of its parts markedly
 smaller. The hull of a part contains the part's surface and, with the cut's outline, the cap
 that closes it: so the union of the hulls contains the solid. A component with holes has no
-inside; its whole hull is used, with a warning. CoACD and V-HACD remesh or voxelise first and
-promise no containment. The hulls are then simplified: `simplify` joins and thins them outwards.
+inside; its whole hull is used, with a warning where a mesh without holes may be cut. CoACD and
+V-HACD remesh or voxelise first and promise no containment. The hulls are then simplified:
+`simplify` joins and thins them outwards.
 """
 
 from __future__ import annotations
@@ -53,7 +54,7 @@ def cut(mesh: trimesh.Trimesh, path: Path) -> CutMesh:
         CollisionModelError: a part has no convex hull.
     """
     pieces: list[Hull] = []
-    open_components = 0
+    open_components = coarse_components = 0
     large, small = _parts(mesh)
     try:
         for component in large:
@@ -63,6 +64,7 @@ def cut(mesh: trimesh.Trimesh, path: Path) -> CutMesh:
                 pieces.extend(decompose(triangles, abs(float(component.volume))))
             else:
                 open_components += 1
+                coarse_components += _may_be_cut(triangles, filled)
                 pieces.append(hull_of(triangles if filled > 0.0 else _thickened(triangles)))
         if len(small):
             joined = np.vstack([mesh.triangles[faces] for faces in small])
@@ -73,10 +75,10 @@ def cut(mesh: trimesh.Trimesh, path: Path) -> CutMesh:
             f"{path}: a part of the mesh has no convex hull; remove triangles that are points or "
             "lines"
         ) from error
-    if open_components:
+    if coarse_components:
         _warn(
             path,
-            f"{open_components} part(s) of the mesh {path.name} are not watertight; the convex "
+            f"{coarse_components} part(s) of the mesh {path.name} are not watertight; the convex "
             "hull of each is used as its collision shape. Close the holes to get a tighter shape",
         )
     if len(small):
@@ -86,7 +88,21 @@ def cut(mesh: trimesh.Trimesh, path: Path) -> CutMesh:
             f"around the {len(small)} smallest is used as their collision shape. Remove screws and "
             "the like to get a tighter shape",
         )
-    return CutMesh(hulls, len(mesh.faces), len(mesh.vertices), len(large) + len(small))
+    parts = len(large) + len(small)
+    return CutMesh(hulls, len(mesh.faces), len(mesh.vertices), parts, open_components)
+
+
+def _may_be_cut(triangles: Array, filled: float) -> bool:
+    """Return False if `decompose` would leave a component whole, however its holes are closed.
+
+    What closes the holes only enlarges the hulls of both halves of a cut.
+
+    Args:
+        filled: volume of the component's hull [m^3].
+    """
+    if np.all(np.ptp(triangles, axis=(0, 1)) <= SMALL_PART):
+        return False
+    return bool(filled > 0.0 and _best_cut(triangles)[0] >= WORTHWHILE * filled)
 
 
 def _warn(path: Path, text: str) -> None:

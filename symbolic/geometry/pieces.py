@@ -37,12 +37,14 @@ class CutMesh:
         hulls: their union contains it.
         faces, vertices, parts: numbers of its triangles, of their corners and of its connected
             components.
+        open_parts: number of the components with holes, each of which is covered by one hull.
     """
 
     hulls: tuple[Hull, ...]
     faces: int
     vertices: int
     parts: int
+    open_parts: int
 
 
 ConvexShape = Box | Cylinder | Sphere | Capsule | Hull
