@@ -229,7 +229,8 @@ def carry_plots(workcell: Workcell) -> dict[str, Plot]:
             "type": "bar",
             "name": plain(f"{robot.name}{whose if judged else ', torques unknown'}"),
             "x": [f"joint {j + 1}" for j in range(joints[i])],
-            "marker": {"color": ARM_COLOURS[i], "opacity": opacity},
+            "marker": {"color": ARM_COLOURS[i]},
+            "opacity": opacity,  # of the trace, which its swatch in the legend has as well
             "meta": {"use": use, "arm": i},
         }
         for i, robot in enumerate(workcell.robots)
