@@ -202,6 +202,25 @@ def without_references(*given: Any) -> tuple[str | None, str | None]:
     return signature, returned
 
 
+GENERATED = {
+    "Tutorials": ["gallery/index"],
+    "Reference": ["reference/command-line", "api/index"],
+}
+"""Pages that exist only on the site, by section of the index."""
+
+
+def with_contents(_: Any, name: str, source: list[str]) -> None:
+    """Give the first page the table of contents that its sections list."""
+    if name != "index":
+        return
+    for section in source[0].split("\n## ")[1:]:
+        caption = section.partition(":")[0]
+        pages = [*re.findall(r"\]\((.+?)\.md\)", section), *GENERATED.get(caption, [])]
+        listed = "\n".join(pages)
+        source[0] += f"\n```{{toctree}}\n:hidden:\n:caption: {caption}\n\n{listed}\n```\n"
+
+
 def setup(app: Any) -> None:
     """Sphinx calls it."""
     app.connect("autodoc-process-signature", without_references)
+    app.connect("source-read", with_contents)

@@ -166,7 +166,6 @@ def test_the_index_lists_every_page() -> None:
     docs, text = ROOT / "docs", (ROOT / "docs/index.md").read_text("utf-8")
     pages = {path.relative_to(docs).as_posix() for path in docs.glob("**/*.md")} - {"index.md"}
     assert pages == {link for link in LINK.findall(text) if "://" not in link}
-    assert pages <= {f"{line}.md" for line in text.splitlines()}
 
 
 def test_the_library_page_groups_every_public_name_once() -> None:
@@ -175,13 +174,13 @@ def test_the_library_page_groups_every_public_name_once() -> None:
     assert sorted(re.findall(r"`(\w+)`", section)) == sorted(ho.__all__)
 
 
-MOST_WORDS = 20_500
-"""Largest number of words of all pages together."""
+MOST_WORDS = 20_000
+"""Largest number of words of all pages together, as `wc -w` counts."""
 
 
 def test_pages_stay_short() -> None:
-    tokens = [w for path in ROOT.glob("docs/**/*.md") for w in path.read_text("utf-8").split()]
-    assert len([w for w in tokens if re.search(r"\w", w)]) <= MOST_WORDS
+    pages = [path.read_text("utf-8") for path in ROOT.glob("docs/**/*.md")]
+    assert sum(len(page.split()) for page in pages) <= MOST_WORDS
 
 
 def test_every_benchmark_has_a_command() -> None:
