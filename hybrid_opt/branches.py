@@ -178,7 +178,9 @@ def search_branches(
     if cell.workcell.task.law.is_drivable:
         cell = _from_rest_to_rest(cell)
     if len(cell.objective_names) != len(REFERENCE_POINT):
-        raise SettingsError("start branches compete by the hypervolume of two objectives")
+        raise SettingsError(
+            "start branches compete by the hypervolume of two objectives", code="objectives"
+        )
     model, wanted = cell.compiled.model, cell.workcell.start_branch
     choices = [
         range(len(found)) if branch == SEARCHED_BRANCH else (max(branch, 0),)

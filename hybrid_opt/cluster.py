@@ -99,7 +99,8 @@ class DaskWorkers(Workers):
             self._give_up(f"lost a task ({type(error).__name__}: {error})")
 
     def _give_up(self, why: str) -> None:
-        raise WorkerError(f"the scheduler at {self._address} {why}; {RESUME_HINT}")
+        text = f"the scheduler at {self._address} {why}; {RESUME_HINT}"
+        raise WorkerError(text, code="cluster")
 
     def _connect(self) -> None:
         if self._client is not None:

@@ -250,7 +250,8 @@ def require_extra(extra: str, use: str) -> None:
     missing = [name for name in EXTRAS[extra] if find_spec(name) is None]
     if missing:
         command = f"pip install 'dual-arm-carry[{extra}]'"
-        raise SettingsError(f"{use} needs {' and '.join(missing)}: {command}")
+        text = f"{use} needs {' and '.join(missing)}: {command}"
+        raise SettingsError(text, code="missing-extra")
 
 
 _SHARED: dict[str, dict[str, Any]] = {

@@ -224,7 +224,8 @@ def open_folder(
             if digest != files.digest:
                 raise ResultsError(
                     f"{root}: holds results of another workcell, or of this one before a change; "
-                    f"{_ELSEWHERE}"
+                    f"{_ELSEWHERE}",
+                    code="another-workcell",
                 )
         copy = _stored_cell(root, files)
         wanted = to_json(configuration_of(settings, root, copy))
@@ -249,7 +250,8 @@ def require_usable(execution: ExecutionSettings) -> None:
     if (root / CONFIGURATION).exists():
         if not (execution.resume or execution.overwrite):
             raise ResultsError(
-                f"{root}: holds a campaign already; continue it with --resume, or {_ELSEWHERE}"
+                f"{root}: holds a campaign already; continue it with --resume, or {_ELSEWHERE}",
+                code="folder-in-use",
             )
         return
     entries = root.iterdir() if root.is_dir() else ()

@@ -264,7 +264,9 @@ def read_configuration(root: str | Path) -> Configuration:
     """
     path = Path(root) / CONFIGURATION
     if not path.parent.exists():
-        raise ResultsError(f"{root}: does not exist; name the results folder of a study")
+        raise ResultsError(
+            f"{root}: does not exist; name the results folder of a study", code="no-results-folder"
+        )
     if not path.exists():
         raise ResultsError(
             f"{root}: is no results folder, {CONFIGURATION} is missing", code="no-results-folder"

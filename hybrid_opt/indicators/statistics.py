@@ -202,7 +202,8 @@ def attainment_surfaces(
     if len(fronts) == 0 or not all(0.0 < percentile <= 100.0 for percentile in percentiles):
         raise SettingsError(
             f"attainment of {len(fronts)} fronts at {list(percentiles)} percent; needed are at "
-            "least one front and percentiles above 0 and up to 100"
+            "least one front and percentiles above 0 and up to 100",
+            code="percentiles",
         )
     sets = [np.asarray(front, dtype=np.float64) for front in fronts]
     filled = [points for points in sets if len(points) > 0]

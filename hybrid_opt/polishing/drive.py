@@ -226,7 +226,8 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         if driver is None or not is_polishable(cell.workcell, driver.robust):
             raise SettingsError(
                 f"the polish of drivable carries needs a drivable cell; {UNPOLISHABLE}: "
-                "switch the polish off"
+                "switch the polish off",
+                code="not-polishable",
             )
         super().__init__(cell, RowSelector(cell), CarryReader(cell))
         self.driver, self._n = driver, task.n_path

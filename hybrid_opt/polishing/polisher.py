@@ -159,5 +159,6 @@ def _require_objectives(
     if not has_polishable_forces(evaluator.workcell, names):
         raise SettingsError(
             "the polish of robust forces knows two round pads that face one another, and no "
-            "others: switch it off"
+            "others: switch it off",
+            code="not-polishable",
         )

@@ -69,7 +69,9 @@ class Wish:
             SettingsError: both targets are given, or a value is not positive.
         """
         if self.duration is not None and self.force is not None:
-            raise SettingsError("duration and force are wished for; give at most one of them")
+            raise SettingsError(
+                "duration and force are wished for; give at most one of them", code="two-wishes"
+            )
         for name, value in self.numbers.items():
             if not 0.0 < value < math.inf:
                 raise SettingsError(

@@ -199,12 +199,14 @@ def recommend(
     if not cell.workcell.task.law.is_drivable:
         raise SettingsError(
             f"the cell's time law is {cell.workcell.task.law.name!r}, which no robot drives; give "
-            "the front of cell.drivable()"
+            "the front of cell.drivable()",
+            code="not-drivable",
         )
     if len(front) == 0:
         raise SettingsError(
             "the drivable front is empty: no feasible carry was found; give the search more "
-            "evaluations or the task wider bounds"
+            "evaluations or the task wider bounds",
+            code="empty-front",
         )
     named: dict[str, Array] = {} if alone else {HAND_MADE: cell.initial[:-1]} | dict(others or {})
     with progress_bar(progress, "recommendation", STEPS + len(named)) as advance:

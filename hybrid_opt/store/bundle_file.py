@@ -98,22 +98,25 @@ def _require_own(folder: Path) -> None:
         return
     remedy = "it stays as it is: move it away, or choose another --output"
     if folder.is_symlink() or not folder.is_dir():
-        raise ResultsError(f"{folder} is in the way of a bundle; {remedy}")
+        raise ResultsError(f"{folder} is in the way of a bundle; {remedy}", code="in-the-way")
     found = sorted(path for path in folder.rglob("*") if path.is_symlink() or not path.is_dir())
     if not found:
         return
     try:
         files = read_manifest(folder)["files"]
     except ResultsError as error:
-        raise ResultsError(f"{found[0]} is in the way of a bundle ({error}); {remedy}") from error
+        text = f"{found[0]} is in the way of a bundle ({error}); {remedy}"
+        raise ResultsError(text, code="in-the-way") from error
     for path in found:
         name = path.relative_to(folder).as_posix()
         if name in (MANIFEST, MEASURED_FILE):
             continue
         if name not in files or path.is_symlink():
-            raise ResultsError(f"{path} is no file of this bundle; {remedy}")
+            raise ResultsError(f"{path} is no file of this bundle; {remedy}", code="foreign-file")
         if sha256(read_bytes(path)) != files[name]:
-            raise ResultsError(f"{path} was changed since it was written; {remedy}")
+            raise ResultsError(
+                f"{path} was changed since it was written; {remedy}", code="changed-file"
+            )
 
 
 def _text(document: Mapping[str, Any]) -> bytes:

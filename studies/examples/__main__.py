@@ -40,7 +40,7 @@ def _copy(options: argparse.Namespace) -> int:
 
     source, target = Path(str(files("studies"))), options.folder / "studies"
     if target.exists():
-        raise ResultsError(f"{target}: exists already; name another folder")
+        raise ResultsError(f"{target}: exists already; name another folder", code="folder-in-use")
     found = [path for pattern in SHIPPED for path in sorted(source.glob(pattern))]
     for path in found:
         write_atomically(target / path.relative_to(source), path.read_bytes())

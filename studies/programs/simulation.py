@@ -333,16 +333,19 @@ def _controller(workcell: Workcell, options: argparse.Namespace) -> str:
     usual = USUAL_CONTROLLER if model.is_squeeze else HANDS
     if (chosen or usual) in (HANDS, *PAD_WITNESSES) and (options.film or options.mjcf):
         raise SimulationError(
-            "films and MJCF files are of cells with arms; give another --controller"
+            "films and MJCF files are of cells with arms; give another --controller",
+            code="controller",
         )
     if chosen is not None and (chosen == HANDS) != (usual == HANDS):
         raise SimulationError(
-            f"--controller {chosen} does not fit this cell of {model.assumption}; leave it out"
+            f"--controller {chosen} does not fit this cell of {model.assumption}; leave it out",
+            code="controller",
         )
     if chosen == PADS_DRIVEN and not model.has_pressure_limit:
         raise SimulationError(
             "planned moments at the wrists belong to pads that choose their pressure; this "
-            f"carry is of {model.assumption}: give another --controller"
+            f"carry is of {model.assumption}: give another --controller",
+            code="controller",
         )
     return chosen or usual
 

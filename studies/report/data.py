@@ -271,7 +271,8 @@ def gather(
     if not (results.root / TIMING).exists():
         raise ResultsError(
             f"{results.root}: a study with --recommend-only has no report; its carry is in "
-            f"{RECOMMENDED_FILE}. Run the study without it, into another folder, for one"
+            f"{RECOMMENDED_FILE}. Run the study without it, into another folder, for one",
+            code="no-report",
         )
     files = first.summary.shown_files.values()
     timings = [read_timing(results.root / TIMING / file) for file in files]

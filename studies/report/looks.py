@@ -107,7 +107,9 @@ def write_animation(geometry: CellGeometry, film: Film, path: Path) -> None:
     """
     suffix = path.suffix.lower()
     if suffix not in (".gif", ".mp4"):
-        raise ReportError(f"animation {path.name!r}: the name must end in .gif or .mp4")
+        raise ReportError(
+            f"animation {path.name!r}: the name must end in .gif or .mp4", code="animation-format"
+        )
     writer = _write_gif if suffix == ".gif" else _write_mp4
     path.parent.mkdir(parents=True, exist_ok=True)
     writer(frames(geometry, film), path)

@@ -147,7 +147,8 @@ def read_reference_front(path: Path) -> ReferenceFront:
         objectives, x = values[:, :2].copy(), values[:, 2:].copy()
     except (ValueError, IndexError) as error:
         told = str(error).splitlines()[0][:200]
-        raise ResultsError(f"{path}: no reference front ({told}); make it again") from error
+        text = f"{path}: no reference front ({told}); make it again"
+        raise ResultsError(text, code="no-reference-front") from error
     for array in (objectives, x):
         array.setflags(write=False)
     return ReferenceFront(digest, objectives, x)

@@ -130,7 +130,7 @@ def labelled(folder: Path) -> list[Path]:
     found = [path for pattern in LABELLED for path in (folder / "experiments").glob(pattern)]
     runs = sorted(path for path in found if path.suffix == ".npz" and path.stem[-2:] != "_R")
     if not runs:
-        raise SettingsError(f"no logs in {folder}; get them by\n{DOWNLOAD_COMMAND}")
+        raise SettingsError(f"no logs in {folder}; get them by\n{DOWNLOAD_COMMAND}", code="no-logs")
     return runs
 
 

@@ -87,7 +87,10 @@ def _polish_cost(root: Path, summary: CampaignSummary) -> int:
         if row.polished is not None
     ]
     if not costs:
-        raise ResultsError(f"{root}: its fronts were not polished; run the study with --polish")
+        raise ResultsError(
+            f"{root}: its fronts were not polished; run the study with --polish",
+            code="not-polished",
+        )
     return int(max(costs))
 
 
@@ -154,7 +157,10 @@ def approaches(root: Path, reference: ReferenceFront) -> list[PolishGap]:
     """
     study = read_campaign(root)
     if study.workcell.digest != reference.digest:
-        raise ResultsError(f"{root}: is a study of another workcell than the reference front's")
+        raise ResultsError(
+            f"{root}: is a study of another workcell than the reference front's",
+            code="another-workcell",
+        )
     best = metrics.hypervolume(reference.objectives)
     found = []
     for name in study.algorithms:

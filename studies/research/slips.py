@@ -123,7 +123,8 @@ def thresholds(options: argparse.Namespace) -> int:
         if (done.seed, done.layer) != (options.seed, options.layer):
             raise SimulationError(
                 f"{path} was begun with seed {done.seed} and layer {done.layer:g}; give these or "
-                "a new file"
+                "a new file",
+                code="another-seed",
             )
     paths = options.cells or sorted(WORKCELLS.glob("*.toml"))
     sources = {path.stem: _Source(path, options.seed) for path in paths}

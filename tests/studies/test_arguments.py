@@ -13,6 +13,7 @@ import pytest
 from studies.__main__ import main, programs
 from studies.options import EXTRAS, PathType, require_extra
 from symbolic.errors import SettingsError
+from tests.refusals import ended_by, refused
 from tests.symbolic.cells import RACK, ROOT
 from tests.waiting import HANGS
 
@@ -125,9 +126,9 @@ def test_a_missing_extra_is_named_before_any_work(
     places["new/x.mp4"] = str(tmp_path / "x.mp4")
     words = [places.get(word, word) for word in line.split()]
     before = sorted(tmp_path.rglob("*"))
-    assert main(words) == 2
     (extra,) = (name for name, needed in EXTRAS.items() if module in needed)
-    assert f"needs {module}: pip install 'dual-arm-carry[{extra}]'" in capsys.readouterr().err
+    with ended_by("missing-extra", module, f"pip install 'dual-arm-carry[{extra}]'"):
+        assert main(words) == 2
     assert sorted(tmp_path.rglob("*")) == before
 
 
@@ -136,7 +137,7 @@ def test_modules_of_an_extra_are_installed_with_the_tests(extra: str) -> None:
     require_extra(extra, "a test")
     with pytest.MonkeyPatch.context() as patch:
         patch.setitem(sys.modules, EXTRAS[extra][0], None)
-        with pytest.raises(SettingsError, match=rf"a test needs {EXTRAS[extra][0]}"):
+        with refused(SettingsError, "missing-extra", EXTRAS[extra][0]):
             require_extra(extra, "a test")
 
 

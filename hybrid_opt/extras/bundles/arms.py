@@ -94,7 +94,8 @@ def require_arms(
             raise SettingsError(
                 f"{target} has to know where the controller of {robot.name!r} is: write "
                 '[robots.driver] with address = "..." into its section of the workcell, or export '
-                "with --address HOST HOST, in the order of the robots"
+                "with --address HOST HOST, in the order of the robots",
+                code="no-address",
             )
 
 

@@ -529,7 +529,8 @@ class Export:
                 f"when one arm stops, the pads end {1e3 * found.distance:.0f} mm apart after "
                 f"{time:.2f} s; handling.partner_stop allows {1e3 * allowed:.0f} mm: time the "
                 f"carry with partner_stop = {allowed**2 / found.distance:.3f}, or press more, "
-                "which shortens the stop"
+                "which shortens the stop",
+                code="partner-stop",
             )
         return found
 

@@ -395,7 +395,8 @@ class _Search:
         if self.too_late:
             longer = f"{LONGER * self.settings.seconds:.0f}"
             begin = f"{begin}, when it was out of time; try {longer} s (--time {longer})"
-        return ProposalError(f"{begin}: {met or 'no path was tried yet'}")
+        text = f"{begin}: {met or 'no path was tried yet'}"
+        return ProposalError(text, code="out-of-time" if self.too_late else "no-path")
 
     def _remedies(self, spins: Array) -> str:
         """Return a text on the least changes with which the box can be held, as far as the time

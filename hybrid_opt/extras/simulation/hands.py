@@ -116,7 +116,9 @@ class HandSimulation:
             SettingsError: the pads press the payload between them.
         """
         if contact_model(workcell).is_squeeze:
-            raise SettingsError("pads press the payload between them; simulate them as pads")
+            raise SettingsError(
+                "pads press the payload between them; simulate them as pads", code="needs-hands"
+            )
         self.workcell = workcell
         self.settings = settings or HAND_SETTINGS
         self._mujoco = mujoco_module()

@@ -70,7 +70,8 @@ def _run(options: argparse.Namespace) -> int:
         "baxter": baxter.source(options.sample, options.seed),
     }
     if options.name not in ("", *known):
-        raise SettingsError(f"no benchmark {options.name!r}; there are {', '.join(known)}")
+        text = f"no benchmark {options.name!r}; there are {', '.join(known)}"
+        raise SettingsError(text, code="unknown-name")
     chosen = {name: known[name] for name in known if options.name in ("", name)}
     if options.folder is None:
         for name, source in chosen.items():

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from codegen import compiled as compiled_module
+from codegen.errors import SlowerWarning
 from hybrid_opt.collision.distances import FCL_RESOLUTION
 from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, CandidateEvaluator, Evaluations
 from hybrid_opt.evaluate.explanation import explain, frequent, missing_reach
@@ -149,6 +150,7 @@ def test_the_plain_check_knows_the_allowed_contacts() -> None:
 WARM_START = """
 import sys
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from codegen.errors import SlowerWarning
 from symbolic.read.cell import load
 workcell = load(sys.argv[1])
 CandidateEvaluator(workcell).evaluate(workcell.task.initial.reshape(-1))
@@ -347,7 +349,7 @@ def test_a_kernel_that_differs_is_not_used(monkeypatch: pytest.MonkeyPatch) -> N
         outputs = ours.outputs(x)
         return outputs | {"q_1": np.nextafter(outputs["q_1"], np.inf)}
 
-    with pytest.warns(RuntimeWarning, match="it differs from the functions"):
+    with pytest.warns(SlowerWarning, match="kernel"):
         assert load_kernel(ours.compiled, ours.checker, others) is None
 
 

@@ -368,9 +368,9 @@ def test_wishes_that_nothing_answers_say_what_is_possible(
         ho.recommend(front, ho.Wish(force=40.0))
     with pytest.raises(SettingsError, match=r"30 kg.* 147"):
         ho.recommend(front, ho.Wish(payload=30.0))
-    with pytest.raises(SettingsError, match="empty"):
+    with refused(SettingsError, "empty-front"):
         ho.recommend(replace(front, x=np.zeros((0, 19))))
-    with pytest.raises(SettingsError, match="drivable"):
+    with refused(SettingsError, "not-drivable"):
         ho.recommend(replace(front, cell=cells.shipped("rack")))
 
 

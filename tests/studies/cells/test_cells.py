@@ -33,6 +33,7 @@ from symbolic.read.cell import load
 from symbolic.records import Uncertainty
 from tests.hybrid_opt.cells import shipped
 from tests.odd_cells import SOURCES, described_cell, plain_cell
+from tests.refusals import refused
 from tests.symbolic.cells import RACK, ROOT, call, standing_text
 
 WORKCELLS = ROOT / "studies" / "workcells"
@@ -104,7 +105,7 @@ def test_robust_forces_keep_to_a_limit_and_hold_random_cases(cell: Cell) -> None
 @pytest.mark.slow
 def test_what_knows_closed_forms_only_refuses_it(cell: Cell) -> None:
     unsure = replace(cell.workcell, uncertainty=UNSURE)
-    with pytest.raises(SettingsError, match="opposite"):
+    with refused(SettingsError, "not-polishable"):
         Polisher(CandidateEvaluator(unsure, ROBUST_OBJECTIVES), PolishSettings())
     with pytest.raises(SettingsError, match="opposite"):
         RobustPath(cell.workcell)

@@ -95,23 +95,23 @@ def test_a_front_comes_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "words"),
+    "content",
     [
-        (b"", "index out of range"),
-        (HEAD, "two objectives and a decision"),
-        (HEAD + b"1,2\n", "two objectives and a decision"),
-        (HEAD + b"1,2,3\n4,5\n", "inhomogeneous"),
-        (HEAD + b"1,2,nan\n", "not finite"),
-        (HEAD + b"1,2,1e999\n", "not finite"),
-        (HEAD + b"1,2,a\n", "could not convert"),
-        (HEAD + b"1,2,\xff\n", "can't decode"),
-        (HEAD + b"1,2,3\n" * 400_000, "more than 1000000 values"),
+        b"",
+        HEAD,
+        HEAD + b"1,2\n",
+        HEAD + b"1,2,3\n4,5\n",
+        HEAD + b"1,2,nan\n",
+        HEAD + b"1,2,1e999\n",
+        HEAD + b"1,2,a\n",
+        HEAD + b"1,2,\xff\n",
+        HEAD + b"1,2,3\n" * 400_000,
     ],
 )
-def test_what_is_none_is_told(tmp_path: Path, content: bytes, words: str) -> None:
+def test_what_is_none_is_told(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "front.csv"
     path.write_bytes(content)
-    with pytest.raises(ResultsError, match=rf"front.csv: no reference front \(.*{words}") as caught:
+    with refused(ResultsError, "no-reference-front", path) as caught:
         read_reference_front(path)
     assert "\n" not in str(caught.value)
 

@@ -91,13 +91,13 @@ def test_compares_cells(
     """The pandas are meshes; a ratio is that of the times."""
     monkeypatch.setattr(side_by_side, "EVALUATIONS", 60)
     pandas = str(RACK.with_name("pandas.toml"))
-    arguments = [str(RACK), "--beside", pandas, "--json", "--candidates", "2", "--repeats", "2"]
+    arguments = [str(RACK), "--beside", pandas, "--json", "--candidates", "2", "--repeats", "1"]
     assert benchmark.main(arguments) == 0
     rack, other = json.loads(capsys.readouterr().out)
     assert (rack["near"], rack["random"], rack["search"], rack["hulls"]) == (1.0, 1.0, 1.0, 0)
     assert other["hulls"] > 10
     for what in ("near", "random"):
-        assert other[what] == pytest.approx(other[f"{what}_ms"] / rack[f"{what}_ms"], rel=0.5)
+        assert other[what] == pytest.approx(other[f"{what}_ms"] / rack[f"{what}_ms"])
         assert other[what] < 4.0
     assert other["search"] == other["search_s"] / rack["search_s"]
 

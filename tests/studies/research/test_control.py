@@ -17,6 +17,7 @@ from studies.research import longer_searches
 from studies.research.best_front import ReferenceFront
 from studies.research.control import main
 from studies.study.summary import read_summary
+from tests.refusals import ended_by, refused
 
 
 @pytest.fixture(scope="module")
@@ -60,12 +61,12 @@ def test_distance_to_a_reference_front(polished: Path) -> None:
     searched = metrics.front_of(np.concatenate([r.front for r in own.replicas[:1]]))
     own_front = ReferenceFront(own.workcell.digest, searched, np.empty((len(searched), 0)))
     assert longer_searches.approaches(polished, own_front)  # the gap to it may be none
-    with pytest.raises(ResultsError, match="another workcell"):
+    with refused(ResultsError, "another-workcell"):
         longer_searches.approaches(
             polished, ReferenceFront("0" * 64, union, np.empty((len(union), 0)))
         )
 
 
-def test_a_study_without_a_polish_is_told(study: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([str(study)]) == 2
-    assert "not polished; run the study with --polish" in capsys.readouterr().err
+def test_a_study_without_a_polish_is_told(study: Path) -> None:
+    with ended_by("not-polished", "--polish"):
+        assert main([str(study)]) == 2

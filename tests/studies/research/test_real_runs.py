@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from studies.research.logged_carries import CROSSTALK, STATED_FRICTION, TOOL, compared, read
 from studies.research.real_runs import main
 from symbolic.array import Array
+from tests.refusals import ended_by
 
 MASS, SQUEEZE, OPPOSED, LENGTH, SLIDE = 2.4, 60.0, 12.0, 0.28, 0.03
 GRASPS = np.array([[0.4, -LENGTH / 2.0, 0.1], [0.4, LENGTH / 2.0, 0.1]])
@@ -168,5 +169,5 @@ def test_every_labelled_run_is_told(tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_how_to_get_the_logs_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main([]) == 0
     assert "git -C FOLDER checkout 6699139" in capsys.readouterr().out
-    assert main(["--folder", str(tmp_path)]) == 2
-    assert "no logs in" in capsys.readouterr().err
+    with ended_by("no-logs", tmp_path):
+        assert main(["--folder", str(tmp_path)]) == 2

@@ -55,6 +55,7 @@ from studies.study.tables import PAPER, simulated, study_tables
 from symbolic.read.cell import load
 from symbolic.read.cell_files import collect_cell
 from tests.hybrid_opt.campaign.fake import OBJECTIVES
+from tests.refusals import ended_by
 from tests.studies.conftest import simulation
 from tests.symbolic.cells import RACK
 
@@ -323,10 +324,10 @@ def test_the_table_tells_threshold_forces_and_what_became_of_the_box() -> None:
 
 
 def test_without_the_simulator_it_is_told_before_the_work(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "mujoco", None)
     output = tmp_path / "results"
-    assert run.main([str(RACK), "--simulate", "--output", str(output)]) == 2
-    assert "--simulate needs mujoco" in capsys.readouterr().err
+    with ended_by("missing-extra", "--simulate", "mujoco"):
+        assert run.main([str(RACK), "--simulate", "--output", str(output)]) == 2
     assert not output.exists()

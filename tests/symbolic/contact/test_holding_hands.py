@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -331,16 +330,16 @@ CUP_KEYS = 'kind = "cup"'
     ("old", "new", "said"),
     [
         ("holding_force = 140.0", "", "holding_force"),
-        (CUP_KEYS, "", "holding_force: found for a pad"),
-        ("patch_radius = 0.03", "patch_size = [0.04, 0.04]", "patch_size: found for a cup"),
+        (CUP_KEYS, "", "holding_force: "),
+        ("patch_radius = 0.03", "patch_size = [0.04, 0.04]", "patch_size: "),
         ("samples = 80", "samples = 80\nreference_force = 90.0", "reference_force"),
-        ("samples = 80", 'samples = 80\nallocation = "paper"', "task.allocation: found 'paper'"),
+        ("samples = 80", 'samples = 80\nallocation = "paper"', "task.allocation: "),
     ],
 )
 def test_what_does_not_fit_hands_is_refused(tmp_path: Path, old: str, new: str, said: str) -> None:
     text = standing_text(RACK.with_name("palletising.toml")).replace(old, new)
     (tmp_path / "cell.toml").write_text(text)
-    with pytest.raises(WorkcellError, match=re.escape(said)):
+    with refused(WorkcellError, "workcell", said):
         load(tmp_path / "cell.toml")
 
 

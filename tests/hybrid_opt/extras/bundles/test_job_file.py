@@ -224,7 +224,7 @@ def test_a_stop_keeps_the_squeeze() -> None:
 
 
 def independent_gap(sampled: SampledJob, kind: str) -> float:
-    """Largest change of the gap [m] while the box is held, at samples and fifths of each step, by
+    """Largest change of the gap [m] while the box is held, at quarters of each step, by
     polynomials of our own: the inverse of what a polynomial's coefficients do to its ends."""
     job, n = sampled.job, {"linear": 1, "cubic": 2, "quintic": 3}[kind]
     ends = [
@@ -234,7 +234,7 @@ def independent_gap(sampled: SampledJob, kind: str) -> float:
     ]
     coefficients = np.linalg.inv(np.array(ends))
     spans = [sampled.span(job.phases.index(phase)) for phase in job.held]
-    starts = np.concatenate([np.arange(span.start, span.stop - 1) for span in spans])[::3]
+    starts = np.concatenate([np.arange(span.start, span.stop - 1) for span in spans])
     h = np.diff(sampled.time)[starts][:, None]
     known = [
         values[starts + end] * h**d
@@ -242,8 +242,7 @@ def independent_gap(sampled: SampledJob, kind: str) -> float:
         for d, values in enumerate((sampled.q, sampled.q_rate, sampled.q_second)[:n])
     ]
     c = np.einsum("ce,enj->cnj", coefficients, np.array(known))
-    shares = (0.0, 0.2, 0.4, 0.6, 0.8)
-    rows = [sum(c[k] * x**k for k in range(2 * n)) for x in shares]
+    rows = [sum(c[k] * x**k for k in range(2 * n)) for x in (0.25, 0.5, 0.75)]
     return float(np.abs(pad_errors(job.workcell, np.concatenate(rows))[0]).max())
 
 
@@ -251,7 +250,7 @@ def independent_gap(sampled: SampledJob, kind: str) -> float:
 def test_the_gap_is_that_of_an_independent_interpolation(kind: Interpolation) -> None:
     sampled = sample_job(rack_job(), 0.2)
     found = gap_of(sampled, kind, 1e4)
-    assert found.along == pytest.approx(independent_gap(sampled, kind), rel=0.5, abs=1e-9)
+    assert found.along == pytest.approx(independent_gap(sampled, kind), rel=1e-6)
     assert found.force == pytest.approx(1e4 / 2.0 * found.along)
 
 
@@ -259,12 +258,12 @@ def test_the_gap_is_that_of_an_independent_interpolation(kind: Interpolation) ->
     ("steps", "interpolation"), sorted({(t.steps, t.interpolation) for t in TARGETS.values()})
 )
 def test_every_target_keeps_the_gap(steps: tuple[float, ...], interpolation: Interpolation) -> None:
-    """At the step that it chooses by itself."""
+    """At the step that it chooses by itself. Of many steps only some are looked at."""
     found = sample_job(rack_job(), chosen_step(rack_job(), steps, interpolation, 1e4))
     gap = independent_gap(found, interpolation)
     held = [phase.force.normal.min() for phase in rack_job().held]
     assert 1e4 / 2.0 * gap <= TRACKED * min(held)
-    assert gap_of(found, interpolation, 1e4).along == pytest.approx(gap, rel=0.5, abs=1e-6)
+    assert 0.98 * gap <= gap_of(found, interpolation, 1e4).along <= 1.000001 * gap
 
 
 def test_the_step_follows_from_the_stiffness() -> None:
