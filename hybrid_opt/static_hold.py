@@ -210,9 +210,9 @@ def require_hold(workcell: Workcell, outputs: Outputs | None = None) -> None:
         raise hold_error(workcell, told)
 
 
-def hold_error(workcell: Workcell, told: str) -> WorkcellError:
-    """Return the error of a payload that cannot be held at rest, with the reason `told`."""
-    return WorkcellError(str(workcell.source), (f"payload: {told}",))
+def hold_error(workcell: Workcell, reason: str) -> WorkcellError:
+    """Return the error of a payload that cannot be held at rest, with the reason."""
+    return WorkcellError(str(workcell.source), (f"payload: {reason}",))
 
 
 def _ends(workcell: Workcell, outputs: Outputs) -> list[tuple[Array, Array]]:

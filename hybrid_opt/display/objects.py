@@ -214,10 +214,11 @@ def _(timing: Timing) -> str:
 
 @heading_of.register
 def _(found: Sensitivities) -> str:
-    told = f"{len(found.missing)} not told of" if found.missing else "all told of"
+    left = len(found.missing)
+    unknown = f"{left} could not be computed" if left else "all could be computed"
     return (
         f"Numbers of {found.workcell.name!r}: press with {found.force:.2f} N, "
-        f"{found.duration:.3f} s; the largest changes first, {told}"
+        f"{found.duration:.3f} s; the largest changes first, {unknown}"
     )
 
 
@@ -233,17 +234,17 @@ def _(found: Sensitivities) -> str:
 
 
 def _changes(row: Sensitivity) -> str:
-    told = [f"{row.change:+.3g} {row.unit}".rstrip() + ":"]
+    parts = [f"{row.change:+.3g} {row.unit}".rstrip() + ":"]
     for slope, lowered, text, unit in (
         (row.force, row.lowered_force, "{:+8.3f}", "N"),
         (row.duration, row.lowered_duration, "{:+8.4f}", "s"),
     ):
         if slope is None or lowered is None:
             continue
-        told.append(f"{text.format(row.change * slope)} {unit}")
+        parts.append(f"{text.format(row.change * slope)} {unit}")
         if abs(slope + lowered) > ONE_WAY * max(abs(slope), abs(lowered)):
-            told.append(f"(lowered {text.format(row.change * lowered).strip()} {unit})")
-    return " ".join(told)
+            parts.append(f"(lowered {text.format(row.change * lowered).strip()} {unit})")
+    return " ".join(parts)
 
 
 def _where(robot: str, joint: str) -> str:

@@ -16,4 +16,4 @@ cell = ho.example("rack")
 found: ho.Sensitivities = ho.sensitivities(cell.carry(cell.initial))
 print(found)
 friction = found["contacts[0].friction"]
-print("newtons per unit of friction:", friction.force, "- not told of:", *found.missing)
+print("newtons per unit of friction:", friction.force, "- not computed:", *found.missing)

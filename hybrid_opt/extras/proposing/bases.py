@@ -313,8 +313,8 @@ class PlaceScorer:
 
 
 def _feet(draft: Workcell, arm: int) -> tuple[Piece, ...]:
-    """Return the fixed bodies of a robot, or of its machine, and a foot, in the base frame. Those
-    of a machine are listed with the first arm."""
+    """Return the pieces that stand with a robot's base, in the base frame: a foot, and the fixed
+    bodies of the robot or of its machine. Fixed bodies of a machine belong to the first arm."""
     robot = draft.robots[arm]
     own = inverse(robot.T_world_base)
     standing = [
