@@ -57,17 +57,17 @@ _KEY_END = re.compile("[-.]")
 
 
 def key_of(what: str, **parts: object) -> str:
-    """Compute the key of a cache entry from its kind and all its ingredients, by name.
+    """Return the key of a cache entry: a digest of the kind `what` and of all ingredients.
 
     Every key of a cache is computed here. The ingredients of each kind are:
 
-      library        the text, the compiler, its level and flags            (`codegen.build`)
-      part           the same of an object file that several libraries share
-      set            a recipe's key, lanes and levels, the compiler, CasADi, `codegen`'s code
-      recipe         a cell's structure and the code of what makes its expressions
+      library        text of the source, compiler, its level and flags (`codegen.build`)
+      part           the same for an object file that several libraries share
+      set            key of the recipe, lanes and levels, compiler, CasADi, code of `codegen`
+      recipe         structure of a cell, and the code that makes its expressions
                      (`hybrid_opt.compiled_cell`)
-      code           packages' sources, for what they do (`Cache.code_digest`)
-      compiler       the processor: which compiler made what is kept (`codegen.build.compiler_of`)
+      code           sources of packages, without comments (`Cache.code_digest`)
+      compiler       processor; the entry names the compiler (`codegen.build.compiler_of`)
     """
     named = [f"{name}={value}" for name, value in sorted(parts.items())]
     return digest(what, str(CACHE_FORMAT), *named)

@@ -221,13 +221,13 @@ class BlockLayout:
 
     @property
     def offsets(self) -> dict[str, int]:
-        """Return the first entry of each block."""
+        """Return the index of the first entry of each block, by name."""
         sizes = self.sizes
         ends = np.cumsum([0, *sizes.values()]).tolist()
         return dict(zip(sizes, ends, strict=False))
 
     def block(self, name: str) -> slice:
-        """Return the slice of a block."""
+        """Return the slice of the block with this name."""
         start = self.offsets[name]
         return slice(start, start + self.sizes[name])
 

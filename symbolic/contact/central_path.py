@@ -85,7 +85,8 @@ class ConvexProgram(Protocol):
         """Symbolic parameters in the formulas, by group. They follow the inputs of `cell_sizes`."""
 
     def free(self, wrenches: list[ca.SX]) -> ca.SX:
-        """Select the free components of all wrenches."""
+        """Select the free components from all wrenches; the load determines the other
+        components."""
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
         """Compute all wrenches from the free components, affinely. The load determines the other
@@ -127,7 +128,7 @@ class Patch(ABC):
 
     @abstractmethod
     def local(self, iterate: ca.SX) -> LocalPatch:
-        """Return the derivatives at an iterate that steps from it need."""
+        """Compute the derivatives of the barrier at an iterate that are needed for a step."""
 
     @abstractmethod
     def potential(self, state: ca.SX) -> ca.SX:
@@ -365,8 +366,8 @@ def _length(lowest: list[ca.SX], share: ca.SX | float) -> ca.SX:
 
 @lru_cache(PROGRAMS)
 def _start(program: ConvexProgram) -> ca.Function:
-    """Build the function from the inputs to the program's start, as an iterate on the central path
-    of a similar problem."""
+    """Build the function from the inputs to the first iterate: the program's start, with
+    multipliers such that it lies on the central path of a similar problem."""
     cell = _sx_inputs(program)
     states, share = program.start(cell)
     effort = program.effort(wrenches_of(program, states), cell)

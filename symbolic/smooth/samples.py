@@ -50,7 +50,7 @@ Quantity = Literal["force", "pressure", "load"]
 frame's origin, along the box's axes [N, N m]."""
 
 QUANTITY_WIDTHS: Mapping[Quantity, int] = {"force": 2, "pressure": 2, "load": 6}
-"""Number of values per sample of each quantity."""
+"""Number of values per sample, by quantity."""
 
 Block = Literal["inner", "first", "last", "path"]
 """'inner': inner samples, one per call. 'first', 'last': the first two and the last two samples.
