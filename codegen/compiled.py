@@ -22,10 +22,10 @@ from codegen.function import NativeCall, NumericFunction, Signature, available_c
 from symbolic.array import Array
 
 _CHUNKS_PER_THREAD = 4
-"""Pieces of a batch per thread: small enough to even out threads that are held up."""
+"""Number of pieces of a batch per thread; several pieces even out delays of single threads."""
 
 _ALIGNMENT = 64
-"""Bytes to which work memory is aligned: the widest vector."""
+"""Alignment of work memory [bytes], the size of the widest vector."""
 
 # Under short names for speed; NumPy arrays are buffers, which their type does not say.
 _writable: Any = ctypes.c_char.from_buffer
@@ -39,20 +39,20 @@ _SUCCESS = -1
 class CompiledFunction(NumericFunction):
     """A function in a shared library with the driver of `codegen.source`.
 
-    Safe to call from several threads: each evaluation has its own work memory, and runs without
+    Several threads may call it at once: each evaluation has its own work memory, and runs without
     the interpreter's lock.
 
     Attributes:
-        library: the shared library's path.
-        lanes: evaluations of a batch that run side by side; 1 where it was built without lanes,
-            or where they do not give the bits of single evaluations.
+        library: path of the shared library.
+        lanes: number of evaluations of a batch that run side by side; 1 if the library was built
+            without lanes, or if lanes give other bits than single evaluations.
     """
 
     def __init__(self, signature: Signature, library: Path, loaded: ctypes.CDLL) -> None:
-        """Take the function of a library.
+        """Wrap the function in a loaded library.
 
         Raises:
-            CodegenError: it has no driver.
+            CodegenError: the library has no driver.
         """
         super().__init__(signature)
         self.library = library
@@ -133,10 +133,11 @@ class CompiledFunction(NumericFunction):
     def _ports(
         self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
     ) -> ctypes.Array[ctypes.c_longlong]:
-        """Return the address and stride of every argument of a batch, as the driver takes them.
+        """Return the address and the stride of every argument of a batch, in the form that the
+        driver takes.
 
         Raises:
-            CodegenError: several values of an input that lanes share.
+            CodegenError: an input that lanes share has several values.
         """
         for name, several, shared in zip(
             self.signature.input_names, batched, self._shared, strict=True
@@ -168,7 +169,7 @@ class CompiledFunction(NumericFunction):
         return run, lambda: self._native(address)
 
     def _native(self, ports: int) -> NativeCall:
-        """Return addresses for C with work memory of this thread."""
+        """Return addresses for calls from C, with work memory of this thread."""
         lanes = self._in_lanes if self.lanes > 1 else None
         own = [0, 0] if lanes is None else [lanes.address, lanes.own.address]
         return NativeCall(self._one.address, own[0], ports, self._one.own.address, own[1])
@@ -183,7 +184,8 @@ class CompiledFunction(NumericFunction):
             raise self._failure(status, " of the batch")
 
     def _lanes_agree(self) -> bool:
-        """Return True if a ragged batch in lanes gives the bits of single evaluations."""
+        """Return True if a batch that does not fill the lanes gives the same bits as single
+        evaluations."""
         rng = np.random.default_rng(0)
         n = self.lanes + 1
         batched = [not shared for shared in self._shared]
@@ -208,13 +210,13 @@ class CompiledFunction(NumericFunction):
 
 
 class _Driver:
-    """One of a library's drivers, with work memory that is reused between calls.
+    """One driver of a library, with work memory that calls reuse.
 
     Attributes:
-        function: evaluates candidates begin to end by the address of their ports and that of work
-            memory; returns the first that failed, or `_SUCCESS`.
-        address: of the function.
-        idle: work memory that no thread uses.
+        function: evaluates candidates from begin to end, given the addresses of their arguments and
+            of work memory. It returns the index of the first evaluation that failed, or `_SUCCESS`.
+        address: address of the function.
+        idle: work memory that no thread uses at present.
     """
 
     def __init__(self, function: Any, sizes: Sequence[int], n_ports: int) -> None:
@@ -226,7 +228,7 @@ class _Driver:
         self.idle, self._own = deque[_Work](), threading.local()
 
     def taken(self) -> _Work:
-        """Take work memory that no other thread uses."""
+        """Return work memory that no other thread uses until it is given back."""
         try:
             return self.idle.pop()
         except IndexError:
@@ -242,7 +244,7 @@ class _Driver:
 
 
 class _Work:
-    """Work memory of one thread at a time, with the addresses the driver wants."""
+    """Work memory for one thread at a time, with the addresses that the driver needs."""
 
     def __init__(self, sizes: Sequence[int], n_ports: int) -> None:
         arg, res, iw, w = sizes
@@ -289,7 +291,7 @@ _threads: dict[int, ThreadPoolExecutor] = {}
 
 
 def thread_pool() -> ThreadPoolExecutor:
-    """Return the process's thread pool; a forked child gets its own."""
+    """Return the thread pool of this process; a forked process gets its own."""
     process = os.getpid()
     if process not in _threads:
         _threads.clear()
