@@ -32,7 +32,7 @@ LAG, STIFFNESS, SPEED = 0.01, 0.25, 0.95
 """Allowed error of the lag [s] and of the stiffness, over the planned one; least speed over the
 planned one."""
 
-EVERY, WINDOW = 0.02, 3
+EVERY, WINDOW = 0.02, 5
 """Between two looks at moving arms [s]; a speed is of so many of these."""
 
 AHEAD, BEHIND = 0.05, 0.3

@@ -171,6 +171,7 @@ class ControlledCell:
         felt: offset of each sensor [N]; None for one that is silent.
         sign: of what the sensors read when the pads press.
         lag: of each arm [s].
+        fastest: largest speed of a joint [rad/s].
         switched: when the hands of an arm were switched, and whether on: (time, arm, on).
         leaks: arms whose hands do not hold.
     """
@@ -181,7 +182,7 @@ class ControlledCell:
         self.record: list[tuple[Any, ...]] = []
         self.silent, self.offset = [False, False], [0.0, 0.0]
         self.felt: list[float | None] = [0.0, 0.0]
-        self.sign, self.lag = 1.0, [0.0, 0.0]
+        self.sign, self.lag, self.fastest = 1.0, [0.0, 0.0], np.inf
         self.grips: list[dict[str, Any]] = config.get("grip", [])
         self.switched: list[tuple[float, int, bool]] = []
         self.leaks = [False, False]
@@ -197,6 +198,7 @@ class ControlledCell:
             for arm, robot in robots.items():
                 self._arms[arm] = made, [made.joints.index(name) for name in robot["ros_joints"]]
         self._told: list[deque[tuple[float, Array]]] = [deque(), deque()]
+        self._moved = [-np.inf, -np.inf]
         self._samples = [
             (np.array(robot["position"]), np.array(robot["hold_effort_without_gravity"]))
             for robot in self.robots
@@ -235,8 +237,10 @@ class ControlledCell:
             while len(told) > 1 and told[1][0] <= self.time() - lag + 1e-9:
                 told.popleft()
             if controller.is_active:
-                q = np.where(controller.stands[part], controller.q[part], told[0][1])
-                controller.q[part] = q
+                most = self.fastest * (told[-1][0] - self._moved[arm])
+                step = np.clip(told[0][1] - controller.q[part], -most, most)
+                controller.q[part] += np.where(controller.stands[part], 0.0, step)
+            self._moved[arm] = told[-1][0]
 
     def pressed(self, arm: int) -> float:
         """Normal force [N] of the job's sample whose posture and effort are the nearest."""

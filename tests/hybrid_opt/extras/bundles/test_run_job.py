@@ -16,7 +16,7 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
-from hybrid_opt.extras.bundles.programs.bring_up import BLOCK, FILE
+from hybrid_opt.extras.bundles.programs.bring_up import BLOCK, FILE, SPEED
 from symbolic.array import Array
 from tests.hybrid_opt.extras.bundles import mock_ros
 from tests.hybrid_opt.extras.bundles.bundles import contents
@@ -388,6 +388,20 @@ def test_a_job_refuses_arms_that_are_not_as_planned(told: str, tmp_path: Path) -
     assert re.search(told, world.log[-1]), world.log
     assert f"--driver {tmp_path / FILE}" in world.log[-1]
     assert {robot["name"] for robot in found["robots"]} == {"left", "right"}
+
+
+def test_bring_up_says_how_fast_arms_of_a_slower_controller_are(tmp_path: Path) -> None:
+    def prepare(world: World) -> None:
+        rates = np.array([job().robots[arm]["velocity"] for arm in (0, 1)])
+        world.fastest = 0.5 * np.abs(rates).max()
+        for k in range(3):
+            world.later(30.0 + k, world.interrupt)
+
+    code, world, found = bring_up("simulation", tmp_path, prepare)
+    assert (code, found) == (2, {})
+    told = re.search(r"speed over the planned one: ([0-9.]+), ([0-9.]+)", world.log[-1])
+    assert told is not None, world.log
+    assert 0.5 < min(float(share) for share in told.groups()) < SPEED
 
 
 def test_a_job_refuses_arms_that_nobody_measured(tmp_path: Path) -> None:
