@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -136,6 +137,36 @@ class Lines:
                         f'{key} is {found!r}: write [robots.driver] with {key} = "..." into '
                         f"{SECTION_OF_EACH}"
                     )
+
+
+def plan_of(
+    workcell: Workcell,
+    target: str,
+    program: str,
+    leads: Sequence[float],
+    stiffness: float | None,
+    presses: bool,
+) -> dict[str, Any]:
+    """Return the values of the drivers that a bundle was planned for. The bundle's bring-up program
+    compares them with the values that it measures.
+
+    Args:
+        workcell: the cell.
+        target: name of the target.
+        program: name of the program that runs the job.
+        leads: compensated part of each arm's lag [s].
+        stiffness: of each arm at its pad [N/m]; None if the job does not depend on it.
+        presses: whether a sensor measures how strongly a block is pressed.
+    """
+    drivers = [vars(robot.driver).items() for robot in workcell.robots]
+    return {
+        "target": target,
+        "program": program,
+        "leads": list(leads),
+        "presses": presses,
+        "stiffness": stiffness,
+        "drivers": [{k: v for k, v in driver if v is not None} for driver in drivers],
+    }
 
 
 SERVICES = Lines(

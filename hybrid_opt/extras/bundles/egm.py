@@ -18,9 +18,9 @@ from collections.abc import Iterator
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybrid_opt.extras.bundles.arms import SECTION_OF_EACH, SEVEN, SIX, comment
-from hybrid_opt.extras.bundles.job_file import Export, pad_jacobians, plan_of, programs
-from hybrid_opt.extras.bundles.programs import filled
+from hybrid_opt.extras.bundles.arms import SECTION_OF_EACH, SEVEN, SIX, comment, plan_of
+from hybrid_opt.extras.bundles.job_file import Export, job_text, pad_jacobians
+from hybrid_opt.extras.bundles.programs import filled, programs
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
@@ -168,7 +168,7 @@ def egm_files(export: Export) -> dict[str, str | bytes]:
     time, force = export.sampled.time, export.sampled.normal_force[:, follower]
     force_rate = float((np.abs(np.diff(force)) / np.diff(time)).max())
     config = {
-        "plan": plan_of(export, "abb-egm", "run_egm.py", lags, True),
+        "plan": plan_of(export.workcell, "abb-egm", "run_egm.py", lags, export.stiffness, True),
         "ports": list(PORTS),
         "addresses": [robot.driver.address for robot in robots],
         "lags": lags,
@@ -186,7 +186,8 @@ def egm_files(export: Export) -> dict[str, str | bytes]:
     modules = {f"{tasks[arm]}/CarryEgm{arm + 1}.mod": _egm_module(export, arm) for arm in (0, 1)}
     return {
         "config/egm.json": json.dumps(config, allow_nan=False) + "\n",
-        **programs(export, "run_egm.py"),
+        "job.json": job_text(export),
+        **programs("run_egm.py"),
         **modules,
     }
 

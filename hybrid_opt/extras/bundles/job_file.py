@@ -28,7 +28,6 @@ from scipy.interpolate import BPoly
 from hybrid_opt.compiled_cell import cache_by_workcell
 from hybrid_opt.errors import JobError
 from hybrid_opt.extras.bundles.arms import prefixes
-from hybrid_opt.extras.bundles.programs import program
 from hybrid_opt.extras.bundles.programs.carry_job import FORMAT, VERSION, Limits
 from hybrid_opt.job.compliance import (
     TRACKED,
@@ -597,39 +596,3 @@ class Export:
 def job_text(export: Export) -> str:
     """Return the text of job.json."""
     return json.dumps(export.document, allow_nan=False, separators=(",", ":")) + "\n"
-
-
-SHARED = ("bring_up.py", "carry_job.py", "carry_machine.py")
-"""Programs in every bundle whose arms are supervised by a program."""
-
-
-def plan_of(
-    export: Export, target: str, program: str, leads: Sequence[float], presses: bool
-) -> dict[str, Any]:
-    """Return the values of the drivers that a bundle was planned for. The bundle's bring-up program
-    compares them with the values that it measures.
-
-    Args:
-        export: the job.
-        target: name of the target.
-        program: name of the program that runs the job.
-        leads: compensated part of each arm's lag [s].
-        presses: whether a sensor measures how strongly a block is pressed.
-    """
-    return {
-        "target": target,
-        "program": program,
-        "leads": list(leads),
-        "presses": presses,
-        "stiffness": export.stiffness if target == "abb-egm" else None,
-        "drivers": [
-            {k: v for k, v in asdict(robot.driver).items() if v is not None}
-            for robot in export.workcell.robots
-        ],
-    }
-
-
-def programs(export: Export, name: str) -> dict[str, str | bytes]:
-    """Return the contents of job.json, of the program `name` that runs the job, and of the programs
-    that this one imports, by path."""
-    return {"job.json": job_text(export), **{each: program(each) for each in (name, *SHARED)}}

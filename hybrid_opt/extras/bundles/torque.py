@@ -39,12 +39,13 @@ from hybrid_opt.extras.bundles.arms import (
     UR,
     described,
     description,
+    plan_of,
     prefixes,
     require_arms,
     ros_joints,
 )
-from hybrid_opt.extras.bundles.job_file import Export, pad_jacobians, plan_of, programs
-from hybrid_opt.extras.bundles.programs import filled, program
+from hybrid_opt.extras.bundles.job_file import Export, job_text, pad_jacobians
+from hybrid_opt.extras.bundles.programs import filled, program, programs
 from hybrid_opt.job.records import Job
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -188,14 +189,17 @@ def torque_files(export: Export) -> dict[str, str | bytes]:
         config["wrench"] = [None, None]
         config["grip"] = [_grip(export, arm) for arm in (0, 1)]
     usual = {
-        "plan": plan_of(export, "torque", "run_job.py", (0.0, 0.0), any(config["wrench"])),
+        "plan": plan_of(
+            export.workcell, "torque", "run_job.py", (0.0, 0.0), None, any(config["wrench"])
+        ),
         "simulated": driver == "simulation",
         "lag": export.lag,
         "step": export.step,
     }
     return {
         "config/cell.json": json.dumps(usual | config, indent=1, allow_nan=False) + "\n",
-        **programs(export, "run_job.py"),
+        "job.json": job_text(export),
+        **programs("run_job.py"),
         f"launch/{driver}.launch.py": program("cell.launch.py"),
         **files,
     }

@@ -20,3 +20,13 @@ def filled(name: str, **values: object) -> str:
         KeyError: a value is missing.
     """
     return Template(program(name)).substitute(values)
+
+
+SHARED = ("bring_up.py", "carry_job.py", "carry_machine.py")
+"""Programs in every bundle whose arms are supervised by a program."""
+
+
+def programs(name: str) -> dict[str, str]:
+    """Return the texts of the program `name` that runs a job and of those that it imports, by
+    path."""
+    return {each: program(each) for each in (name, *SHARED)}

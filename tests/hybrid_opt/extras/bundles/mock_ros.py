@@ -19,7 +19,8 @@ from unittest.mock import patch
 
 from rosbags.typesys import Stores, get_typestore
 
-from hybrid_opt.extras.bundles.job_file import SHARED, Contents
+from hybrid_opt.extras.bundles.job_file import Contents
+from hybrid_opt.extras.bundles.programs import SHARED
 from hybrid_opt.store.bundle_file import write_bundle
 from tests.hybrid_opt.extras.bundles.bundles import as_planned
 from tests.hybrid_opt.extras.bundles.controlled import SUCCEEDED, ControlledCell
