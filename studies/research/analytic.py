@@ -88,13 +88,12 @@ BANDS: dict[tuple[str, int], Band] = {
 def judge(
     ours: Summary, reference: float, *, higher_is_better: bool, std: float | None = None
 ) -> Verdict | None:
-    """Return True if our mean agrees with a band's.
-
-    The band is the reference mean plus and minus three standard errors of the difference of the two
-    means. The reference's spread is taken as ours where it is not known.
+    """Compare the mean of our figure with that of a reference band: 'inside' if they differ by at
+    most three standard errors of the difference of both means, else 'better' or 'worse'. Where the
+    reference's spread is unknown, ours is used.
 
     Returns:
-        None where fewer than two seeds leave the spread unknown.
+        The verdict; None with fewer than two seeds, because the spread is then unknown.
     """
     if ours.count < 2:
         return None
@@ -163,7 +162,8 @@ def _run(
 
 
 def _band(problem: str, evaluations: int, algorithm: str, population: int) -> Band | None:
-    """Return the band of Coello's MOPSO and of its variants, for the swarm that it holds for."""
+    """Return the reference band for an algorithm, population and budget, None without one. The
+    bands are for Coello's MOPSO and its variant."""
     applies = algorithm.startswith("mopso") and population == BAND_POPULATION
     return BANDS.get((problem, evaluations)) if applies else None
 
@@ -266,7 +266,7 @@ def _tests(shifted: dict[str, list[_AlgorithmRun]]) -> tuple[RankTest, ...]:
 
 
 def table(result: AlgorithmTest) -> str:
-    """Format the comparison."""
+    """Return the comparison as text."""
     lines = [
         f"Mean over {result.seeds} seeds of the final front (limited size) and of all evaluated "
         "points",
@@ -323,7 +323,7 @@ def _cells(score: Score) -> tuple[str, ...]:
 
 
 def algorithms(options: argparse.Namespace) -> int:
-    """Run the comparison that the options ask for, and print it; returns the exit code."""
+    """Run the comparison that the options request, and print it. Return the exit code."""
     result = compare(
         options.problems,
         options.evaluations,
@@ -425,7 +425,8 @@ def _zdt3_front() -> Array:
 
 
 def _tnk_front() -> Array:
-    """Sample the front: the curved constraint is active; the circular one cuts pieces out."""
+    """Sample the reference front of TNK: the curved constraint is active, and the circular one cuts
+    pieces out."""
     angle = np.linspace(0.0, 0.5 * np.pi, _DENSE)
     # arctan(x1 / x2) is the angle from the x2 axis.
     radius = np.sqrt(1.0 + 0.1 * np.cos(16.0 * angle))
@@ -434,8 +435,8 @@ def _tnk_front() -> Array:
 
 
 def _srn_front() -> Array:
-    """Sample the front from the point nearest to (2, 1) on the line, up x1 = -2.5, then along the
-    circle."""
+    """Sample the reference front of SRN: from the point nearest to (2, 1) on the line, up x1 =
+    -2.5, then along the circle."""
     line_x2 = np.linspace(2.5, 3.7, _DENSE)
     line = np.column_stack([3.0 * line_x2 - 10.0, line_x2])
     column_x2 = np.linspace(2.5, np.sqrt(225.0 - 2.5**2), _DENSE)
@@ -447,8 +448,8 @@ def _srn_front() -> Array:
 
 
 def _osy_front() -> Array:
-    """Return five pieces with x4 = x6 = 0 (Deb 2001, Multi-objective optimization, section
-    8.3.3)."""
+    """Sample the reference front of OSY, five pieces with x4 = x6 = 0 (Deb 2001, Multi-objective
+    optimization, section 8.3.3)."""
     s = np.linspace(0.0, 1.0, _DENSE // 5)
     one, zero = np.ones_like(s), np.zeros_like(s)
     bend = np.linspace(37.0 / 9.0 - 1.0 / 18.0, 5.0, len(s))

@@ -54,7 +54,7 @@ WAYPOINTS = (1, 2, 3, 4, 5, 6, 7, 8)
 
 
 def benchmark_cell(options: argparse.Namespace) -> int:
-    """Measure the cell, cells or study that the options ask for; returns the exit code."""
+    """Measure the cell, the cells or the study that the options request. Return the exit code."""
     if options.study:
         print(study_table(profile_study(_workcell(options.workcell), options.seed)))
         return 0
@@ -81,8 +81,8 @@ def _workcell(path: Path | None) -> Workcell:
 def benchmark(
     workcell: Workcell, candidates: int = 10, repeats: int = 3, seed: int = 0
 ) -> dict[str, Any]:
-    """Measure one cell with decision vectors uniform within the bounds, in some rounds with each of
-    them; every time is in milliseconds per candidate.
+    """Measure the evaluation of one cell at random decision vectors, in several rounds. All times
+    are in milliseconds per candidate.
 
     Raises:
         CodegenError: there is no compiler.
@@ -130,7 +130,8 @@ def benchmark(
 
 
 def _scaling(model: CellModel, candidates: int, repeats: int, seed: int) -> dict[str, Any]:
-    """Compute the compiled cost against the numbers of samples and of free waypoints."""
+    """Measure how the time of the compiled evaluation grows with the number of samples and of free
+    waypoints."""
     task = model.workcell.task
     by_samples = {n: replace(task, samples=n) for n in SAMPLE_COUNTS}
     by_waypoints = {n: with_free_waypoints(task, n) for n in WAYPOINTS}
@@ -167,8 +168,8 @@ def _costs(
     seed: int,
     what: str,
 ) -> dict[int, Array]:
-    """Compute seconds per candidate (rounds,) of the compiled evaluator for each task, taken in
-    turns."""
+    """Return the time per candidate of each task's compiled evaluator (rounds,) [s]. The tasks are
+    measured in turns."""
     ways: dict[str, Evaluate] = {}
     x: dict[str, Array] = {}
     for n, task in tasks.items():
@@ -180,10 +181,10 @@ def _costs(
 
 
 def with_free_waypoints(task: Task, count: int) -> Task:
-    """Return the task with another number of free waypoints between its start and goal.
+    """Return the task with another number of free waypoints between start and goal.
 
-    They lie evenly along the polygon of the hand-made trajectory; each may deviate as far as the
-    narrowest of the original ones.
+    They are spread evenly along the polygon of the hand-made trajectory. Each may deviate as far as
+    the original waypoint with the narrowest bounds.
     """
     points = np.array([waypoint.lower for waypoint in task.waypoints])
     points[list(task.free_indices)] = task.initial
@@ -230,7 +231,7 @@ def _processor() -> str:
 
 
 def report(result: Mapping[str, Any]) -> str:
-    """Compute all figures of `benchmark`."""
+    """Return the results of `benchmark` as text."""
     machine, scaling, searched = result["machine"], result["scaling"], result["with_collisions"]
     line, random = scaling["samples_line"], searched["random"]
     ways: list[tuple[str, ...]]
@@ -280,14 +281,14 @@ def _shares(figures: Mapping[str, Any]) -> str:
 COSTED_EVALUATIONS = 1000
 POLISH_ATTEMPTS = 4
 LEAST_LISTED_SHARE = 0.02
-"""Parts below this share of their stage are summed up as 'other'."""
+"""Parts of a stage below this share are summed up as 'other'."""
 
 _ROOT = Path(__file__).resolve().parents[1]
 
 
 @dataclass(frozen=True)
 class StageTime:
-    """Core-seconds of a stage, without the profiler as `seconds`, and by part as profiled."""
+    """Core-seconds of one stage of a study: `seconds` without the profiler, and by part with it."""
 
     name: str
     seconds: float
@@ -295,7 +296,8 @@ class StageTime:
 
 
 def profile_study(workcell: Workcell, seed: int) -> tuple[StageTime, ...]:
-    """Time one replica of NSGA-II, the polish of some of its front, and the timing of one carry."""
+    """Measure the core-seconds of one replica of NSGA-II, of the polish of a part of its front, and
+    of the timing of one carry."""
     cell = Cell(workcell)
     progress("compiling what the stages need")
     cell.evaluator.evaluate(cell.initial[None])
@@ -340,7 +342,7 @@ def _timed(name: str, run: Callable[[], object]) -> StageTime:
 
 
 def _part(file: str, function: str) -> str:
-    """Return the room of this project or the library that a function belongs to."""
+    """Return the package of this project, or the library, to which a profiled function belongs."""
     path = Path(file)
     if path.is_relative_to(_ROOT):
         return "/".join(path.relative_to(_ROOT).parts[:2]).removesuffix(".py")
@@ -351,7 +353,7 @@ def _part(file: str, function: str) -> str:
 
 
 def study_table(stages: tuple[StageTime, ...]) -> str:
-    """Format the figures."""
+    """Return the results of `profile_study` as text."""
     rows = []
     for stage in stages:
         total = sum(stage.parts.values())

@@ -27,31 +27,32 @@ from symbolic.records.cell import HandKind
 from symbolic.records.poses import transform
 
 CELL = Path(__file__).parents[1] / "workcells" / "palletising.toml"
-"""Whose payload and hands are exchanged; its arms do not matter."""
+"""Workcell file of which payload and hands are replaced; its arms have no influence."""
 
 KINDS = ("cups above", "cups beside", "magnets", "fingers")
 
 QUINTIC_SAMPLES = 101
 
 SWINGS = 15.0
-"""How often a payload swings on its layers in a carry, at least; the model is of layers that do not
-swing."""
+"""Least number of natural oscillations of the payload on its layers during a carry. The contact
+model does not include oscillations."""
 
 LOW, HIGH, BISECTIONS = 0.5, 1.5, 7
-"""Factors between which a threshold is looked for, to 0.4 %."""
+"""Bounds of the factor on the holding force, and number of bisections between them, which reach an
+accuracy of 0.4 %."""
 
 
 @dataclass(frozen=True)
 class HandThreshold:
-    """What the simulator says of one carry.
+    """Result of the simulator for one carry.
 
     Attributes:
-        kind: of the hands, one of `KINDS`.
-        hands: how many.
-        swings: how often the payload would swing on its layers in the carry.
-        needed: holding force that the contact model asks for [N].
-        ratio: least holding force in the simulator over it.
-        lifts: whether a rim lifts below that; else something slips.
+        kind: kind of the hands, one of `KINDS`.
+        hands: number of hands.
+        swings: number of natural oscillations of the payload on its layers during the carry.
+        needed: holding force that the contact model requires [N].
+        ratio: least holding force that suffices in the simulator, over the required one.
+        lifts: True if a rim lifts below that force, False if a hand slips.
     """
 
     kind: str
@@ -69,7 +70,8 @@ class HandThreshold:
 
 
 def draw(kind: str, rng: np.random.Generator, least_swings: float = SWINGS) -> Carry:
-    """Draw a payload in hands of a kind and its carry, among those that swing often enough."""
+    """Return a random payload in hands of a kind with a random carry, in which the payload would
+    oscillate at least `least_swings` times."""
     while True:
         workcell = _draw_cell(kind, rng)
         turned = rng.uniform(-0.4, 0.4, 3) * rng.integers(0, 2)
@@ -80,13 +82,13 @@ def draw(kind: str, rng: np.random.Generator, least_swings: float = SWINGS) -> C
 
 
 def needed_force(carry: Carry) -> float:
-    """Compute the holding force that the contact model asks of the hands of a carry [N]."""
+    """Return the holding force that the contact model requires for a carry [N]."""
     model = interpreted_robust_model(carry.workcell)
     return float(model.nominal(box_motion(carry)).max())
 
 
 def threshold(kind: str, carry: Carry) -> HandThreshold:
-    """Find the least holding force of a carry in the simulator."""
+    """Find the least holding force with which a carry succeeds in the simulator."""
     workcell = carry.workcell
     needed = needed_force(carry)
     simulate = partial(
@@ -104,7 +106,7 @@ def threshold(kind: str, carry: Carry) -> HandThreshold:
 
 
 def carry_along(workcell: Workcell, path: Array, duration: float) -> Carry:
-    """Return a carry from rest to rest by path (6,), a pose's change, with as yet no forces.
+    """Return a carry that changes the pose by `path` (6,) from rest to rest, without forces.
 
     The motion is the quintic 10 s^3 - 15 s^4 + 6 s^5.
     """
@@ -145,7 +147,8 @@ def carry_along(workcell: Workcell, path: Array, duration: float) -> Carry:
 
 
 def _draw_cell(kind: str, rng: np.random.Generator) -> Workcell:
-    """Draw a payload of 3 to 15 kg and the hands of two arms at opposite sides or edges of it."""
+    """Return a cell with a random payload of 3 to 15 kg, and hands of two arms at opposite sides or
+    edges of it."""
     is_plate = kind == "fingers"
     lower, upper = ([0.3, 0.4, 0.004], [0.6, 0.8, 0.02]) if is_plate else ([0.3] * 3, [0.6] * 3)
     size = rng.uniform(lower, upper)
@@ -200,13 +203,14 @@ def _draw_cell(kind: str, rng: np.random.Generator) -> Workcell:
 
 
 def _axes(normal: Array) -> Array:
-    """Return axes (3, 3) with z along a normal and x along that of the payload."""
+    """Return axes (3, 3) as columns with z along a normal and x along the payload's x axis, which
+    must be perpendicular to it."""
     x = np.array([1.0, 0.0, 0.0])
     return np.column_stack([x, np.cross(normal, x), normal])
 
 
 def summary(found: Sequence[HandThreshold]) -> str:
-    """Return one line about all ratios."""
+    """Return one line of text about the ratios of all carries."""
     ratios = np.array([one.ratio for one in found])
     return (
         f"{len(found)} carries: ratio {ratios.min():.3f} to {ratios.max():.3f}, median "
@@ -216,7 +220,7 @@ def summary(found: Sequence[HandThreshold]) -> str:
 
 
 def thresholds(options: argparse.Namespace) -> int:
-    """Print the threshold of every carry; returns the exit code."""
+    """Print the threshold of each carry. Return the exit code."""
     print("hands        count  swings     needed     ratio  below it")
     found = []
     for k, kind in enumerate(islice(cycle(KINDS), options.carries)):

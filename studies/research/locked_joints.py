@@ -23,12 +23,12 @@ from symbolic.records import Task
 
 @dataclass(frozen=True)
 class LockedReplica:
-    """One replica with the redundant joints free, and locked.
+    """Results of one replica.
 
     Attributes:
         free: hypervolume with the redundant joints free.
-        locked: per lock its hypervolume, in the order of `locks`.
-        best: positions of the best lock [rad or m].
+        locked: hypervolumes with the joints locked, one per lock in the order of `locks`.
+        best: positions of the lock with the largest hypervolume [rad or m].
     """
 
     free: float
@@ -37,8 +37,8 @@ class LockedReplica:
 
 
 def locks(task: Task, count: int) -> tuple[tuple[float, ...], ...]:
-    """Return a grid of at least `count` positions of the redundant joints, the middles of its
-    cells."""
+    """Return at least `count` combinations of positions of the redundant joints: the middles of the
+    cells of a grid over their bounds."""
     sides = max(ceil(count ** (1.0 / len(task.redundant)) - 1e-9), 1)
     shares = (np.arange(sides) + 0.5) / sides
     values = [
@@ -51,10 +51,10 @@ def locks(task: Task, count: int) -> tuple[tuple[float, ...], ...]:
 def compare(
     cell: Cell, count: int, replicas: int, evaluations: int, seed: int
 ) -> list[LockedReplica]:
-    """Run the replicas.
+    """Search with free and with locked redundant joints, in several replicas.
 
     Raises:
-        SettingsError: no joint is redundant, or one is fixed at a waypoint.
+        SettingsError: the cell has no redundant joint, or one is fixed at a waypoint.
     """
     task = cell.workcell.task
     if not task.redundant:
@@ -85,7 +85,7 @@ def _volume(evaluations: Evaluations) -> float:
 
 
 def as_text(found: Sequence[LockedReplica]) -> str:
-    """Format the comparison for a terminal."""
+    """Return the comparison as text."""
     lines = ["replica     free  best lock  locks with a carry  at"]
     for k, one in enumerate(found):
         some = sum(volume > 0.0 for volume in one.locked)
@@ -98,10 +98,10 @@ def as_text(found: Sequence[LockedReplica]) -> str:
 
 
 def redundancy(options: argparse.Namespace) -> int:
-    """Compare as the options ask for, and print it; returns the exit code.
+    """Make the comparison that the options request, and print it. Return the exit code.
 
     Raises:
-        SettingsError: no joint of the cell is redundant.
+        SettingsError: the cell has no redundant joint.
     """
     cell = Cell(load_workcell(options.workcell))
     counts = (options.locks, options.replicas, options.evaluations, options.seed)

@@ -25,18 +25,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ProblemAttempt:
-    """One proposal.
+    """Result of one proposal.
 
     Attributes:
-        problem, seed: what was asked for.
-        problem_met: why there is no carry, '' where there is one.
-        certified: core-seconds to the first certified carry, imports left out.
+        problem, seed: name of the problem and seed.
+        problem_met: why there is no carry, '' if there is one.
+        certified: core-seconds to the first certified carry, without imports.
         seconds: core-seconds of the whole proposal.
-        length: how far all joints go together [rad].
-        passes: what it passes, on which side.
-        duration: of the recommended carry [s].
-        force: to command, the larger of both arms [N].
-        allowed: whether that force is within the reference force in every case.
+        length: length of the joint path, all joints together [rad].
+        passes: obstacles that the carry passes, and on which side.
+        duration: duration of the recommended carry [s].
+        force: larger commanded force of both arms [N].
+        allowed: True if this force is within the reference force in every case.
     """
 
     problem: str
@@ -52,12 +52,12 @@ class ProblemAttempt:
 
 
 def shipped_problems() -> list[Path]:
-    """Return the problem files of `studies/problems`."""
+    """Return the paths of all problem files in `studies/problems`."""
     return sorted(Path(str(files("studies"))).joinpath("problems").glob("*.toml"))
 
 
 def attempt(path: Path, seed: int, seconds: float, evaluations: int) -> ProblemAttempt:
-    """Propose a carry for a problem, and recommend one where a search gets evaluations."""
+    """Propose a carry for a problem, and recommend one if `evaluations` of a search are allowed."""
     import numpy as np
 
     import hybrid_opt as ho

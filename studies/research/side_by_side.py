@@ -19,24 +19,27 @@ from symbolic.array import Array
 from symbolic.geometry.pieces import Hull
 
 SPREAD = 0.02
-"""Standard deviation of candidates near the hand-made path, as a share of the bounds' width."""
+"""Standard deviation of candidates near the hand-made path, as a share of the width of the
+bounds."""
 
 EVALUATIONS = 400
-"""Evaluations of a drivable search."""
+"""Number of evaluations of a drivable search."""
 
 
 def compare(
     cells: Sequence[Cell], batches: int, repeats: int, seed: int = 0
 ) -> list[dict[str, Any]]:
-    """Measure the compiled evaluation of cells, collisions included, in the thread's own time.
+    """Measure the compiled evaluation of several cells, collisions included, in the thread's own
+    time.
 
     Args:
-        batches: of a search's population, near the hand-made path and random, for each cell.
-        repeats: rounds with each batch.
-        seed: of the candidates and of the searches.
+        cells: the cells.
+        batches: number of batches near the hand-made path, and of random ones, per cell.
+        repeats: number of rounds with each batch.
+        seed: of candidates and searches.
 
     Returns:
-        For each cell its numbers of bodies, pieces, hulls and pairs; milliseconds per candidate
+        For each cell the numbers of bodies, pieces, hulls and pairs; milliseconds per candidate
         'near_ms' and 'random_ms', means over the rounds; core-seconds 'search_s' of a drivable
         search; and means of the ratios to the first cell, 'near', 'random' and 'search'.
     """
@@ -69,7 +72,7 @@ def _contents(cell: Cell) -> dict[str, Any]:
 
 
 def _candidates(cell: Cell, what: str, batches: int, rng: np.random.Generator) -> Array:
-    """Return candidates (batches, population, n_var)."""
+    """Return candidates (batches, population, n_var) of a cell; `what` is 'near' or 'random'."""
     size = (batches, POPULATION, cell.n_var)
     if what == "random":
         return rng.uniform(cell.lower, cell.upper, size)
@@ -78,7 +81,7 @@ def _candidates(cell: Cell, what: str, batches: int, rng: np.random.Generator) -
 
 
 def _search_seconds(cell: Cell, seed: int) -> float:
-    """Return core-seconds of a drivable search whose functions are compiled already."""
+    """Return the core-seconds of a drivable search with functions that are already compiled."""
     drivable = cell.drivable()
     drivable.evaluate(drivable.initial)
     start = time.process_time()
@@ -87,7 +90,7 @@ def _search_seconds(cell: Cell, seed: int) -> float:
 
 
 def table(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Format the figures of `compare`."""
+    """Return the results of `compare` as text."""
     counts = ("bodies", "pieces", "hulls", "pairs")
     costs = (("near_ms", "near"), ("random_ms", "random"), ("search_s", "search"))
     head = ("cell", *counts, "near, ms", "over", "random, ms", "over", "search, core-s", "over")

@@ -28,21 +28,21 @@ from symbolic.records import Workcell
 Evaluate = Callable[[Array], object]
 
 SLICE = 0.05
-"""Least time of one way in one round [s]; fast ways go on with the next candidates to fill it, as a
-search goes on with its next generation: what another way left in the caches costs no more than
-there."""
+"""Least time of one way of evaluation per round [s]. Fast ways evaluate further candidates to fill
+it, as a search does, so that refilling the processor's caches costs no more than in a search."""
 
 
 def interleaved(
     ways: Mapping[str, Evaluate], x: Mapping[str, Array], repeats: int
 ) -> dict[str, Array]:
-    """Compute seconds per call of every way in every round (rounds,); the ways take turns.
+    """Return the time per call of each way of evaluation in each round (rounds,) [s]. The ways are
+    measured in turns.
 
     Args:
-        ways: functions of one decision vector, or of one batch of them, by name.
-        x: per way what it is called with: decision vectors (n, n_var) or batches (n, size, n_var),
-            the same n for all.
-        repeats: rounds with each of the n.
+        ways: functions of one decision vector, or of one batch, by name.
+        x: arguments for each way: decision vectors (n, n_var) or batches (n, size, n_var), with the
+            same n for all.
+        repeats: number of rounds with each of the n.
     """
     counts = {}
     for name, evaluate in ways.items():
@@ -58,7 +58,8 @@ def interleaved(
 
 
 def _seconds(evaluate: Evaluate, x: Array, first: int, count: int) -> float:
-    """Compute seconds per call for `count` rows of x one after the other."""
+    """Return the time per call for `count` rows of x, from row `first` on, one after the other
+    [s]."""
     start = time.thread_time()
     for k in range(first, first + count):
         evaluate(x[k % len(x)])
@@ -68,11 +69,11 @@ def _seconds(evaluate: Evaluate, x: Array, first: int, count: int) -> float:
 def summary(
     times: Mapping[str, Array], average: Callable[[Array], np.floating] = np.median
 ) -> dict[str, float]:
-    """Compute averages [ms] of every way and averages of the ratios within a round.
+    """Return the average time of each way [ms], and the averages of the ratios within a round.
 
     Args:
         times: seconds per candidate (rounds,) of 'compiled', 'interpreted' and 'plain'.
-        average: over the rounds.
+        average: function that averages over the rounds.
     """
     ratios = {
         f"{name}_over_compiled": float(average(times[name] / times["compiled"]))
@@ -82,7 +83,7 @@ def summary(
 
 
 def progress(text: str) -> None:
-    """Tell what is being done, apart from the results."""
+    """Print a text on the present work to standard error."""
     print(text, file=sys.stderr, flush=True)
 
 
@@ -90,7 +91,7 @@ CLOCK_ROUNDS = 2_000_000
 BEST_OF = 5
 
 RARE = frozenset({"closer", "again", "held"})
-"""Branches of `symbolic.robot.arm.track_function`."""
+"""Names of branches of `symbolic.robot.arm.track_function` that few samples take."""
 
 _LOOP = """
 /* Additions and multiplications that wait for nothing but their own last one. */
@@ -112,11 +113,8 @@ DUAL_ARM_EXPORT double dual_arm_peak(long long rounds) {
 
 
 def peak_operations() -> float | None:
-    """Compute additions and multiplications per second that one core does in lanes; None without
-    lanes.
-
-    Measured: the best of some runs of a loop of sixteen independent chains.
-    """
+    """Measure the additions and multiplications per second of one core in lanes: the best of
+    several runs of a loop with sixteen independent chains. None without lanes."""
     library = load_or_build_program("peak", "peak", dict, _LOOP)
     if library.dual_arm_lanes() < 2:
         return None
@@ -131,9 +129,10 @@ def peak_operations() -> float | None:
 
 
 def candidate_operations(model: CellModel) -> int:
-    """Compute the operations of one candidate with collisions, counted in its CasADi functions.
+    """Return the number of operations of one candidate with collisions, counted in the CasADi
+    functions.
 
-    Without the branches that few samples take; a sine or cosine counts as one.
+    Branches that few samples take are left out; a sine or cosine counts as one operation.
     """
     functions = kernel_functions(model)
     each = sum(operations(functions[name], RARE) for name in ("sample", "clearance"))
@@ -141,13 +140,13 @@ def candidate_operations(model: CellModel) -> int:
 
 
 TURN_EVALUATIONS = 1000
-"""Evaluations of the NSGA-II search whose candidates are timed."""
+"""Number of evaluations of the NSGA-II search whose candidates are timed."""
 
 POPULATION = GeneticSettings().population
-"""Candidates per batch."""
+"""Number of candidates per batch."""
 
 SHARE_BATCHES = 5
-"""Most batches on which the shares of the time are measured."""
+"""Largest number of batches with which the shares of the time are measured."""
 
 
 def with_collisions(
@@ -210,13 +209,13 @@ def with_collisions(
 
 
 def shares(evaluator: CandidateEvaluator, batches: Array, repeats: int) -> dict[str, float]:
-    """Compute the shares of the time of the compiled way.
-
-    candidate: path, arms, forces and objectives. collisions: bounds, proofs and FCL.
+    """Measure the shares of the time of the compiled evaluation: 'candidate' is path, arms, forces
+    and objectives; 'collisions' is bounds, proofs and FCL.
 
     Args:
-        batches: (n, size, n_var).
-        repeats: rounds with each batch.
+        evaluator: evaluator of the cell.
+        batches: (n, size, n_var) candidates.
+        repeats: number of rounds with each batch.
     """
     ways: dict[str, Evaluate] = {
         "whole": evaluator.evaluate,

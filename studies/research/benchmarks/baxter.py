@@ -37,19 +37,20 @@ tar -xjf FOLDER/{RESOURCES}/problems.tar.bz2 -C FOLDER/{RESOURCES}"""
 DIFFICULTIES = ("easy", "medium", "hard")
 
 SCENES = 600
-"""Scenes of each kind."""
+"""Number of published scenes of each kind."""
 
 CAN_BOX = (0.10, 0.20, 0.10)
-"""A little lower than a can [m]."""
+"""Edges of the carried box [m]; it is a little lower than a can."""
 
 BEFORE = (0.70, 0.10)
 """Distance of the box's start ahead of the machine, and height above the shoulders' frame [m]."""
 
 CLEARED = 0.2
-"""Height above a board within which a can's middle means that it stands there [m]."""
+"""Largest height of a can's middle above a board with which the can counts as standing on it
+[m]."""
 
 AIR = 0.01
-"""Gap below the box where it stands on a board [m]."""
+"""Gap between a board and the box that stands on it [m]."""
 
 PADDLE = (0.06, 0.03, 0.17)
 """Paddle in place of each gripper, as long; its flat side presses: width, thickness, length [m]."""
@@ -64,10 +65,10 @@ BAXTER_NOTE = (
 
 
 def source(count: int, seed: int) -> BenchmarkSource:
-    """Return a sample of the scenes.
+    """Return the benchmark of a random sample of the scenes.
 
     Args:
-        count: of each kind.
+        count: number of scenes of each kind.
         seed: of the sample.
     """
 
@@ -85,14 +86,15 @@ def source(count: int, seed: int) -> BenchmarkSource:
 
 
 class Hands:
-    """Where Baxter's hands are."""
+    """Forward kinematics of Baxter's two hands."""
 
     def __init__(self, urdf: Path) -> None:
         self._model = pin.buildModelFromUrdf(str(urdf))
         self._data = self._model.createData()
 
     def at(self, joints: dict[str, float]) -> tuple[Array, Array]:
-        """Return positions (3,) of the left and the right hand [m]."""
+        """Return the positions (3,) of the left and the right hand at joint positions by name
+        [m]."""
         q = pin.neutral(self._model)
         for name, value in joints.items():
             if self._model.existJointName(name):
@@ -104,10 +106,11 @@ class Hands:
 
 
 def request(path: Path) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the joints in which both arms begin and end, by name.
+    """Return the joint positions by name in which both arms begin, and in which they end, from a
+    scene's request file.
 
     Raises:
-        OutsideError: it is no such request.
+        OutsideError: the file is not such a request.
     """
     data = read_message(path)
     try:

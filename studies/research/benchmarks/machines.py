@@ -42,7 +42,7 @@ MACHINES_NOTE = "Nothing was published: the makers plan for each arm by itself."
 
 
 def benchmark(folder: Path) -> Benchmark:
-    """Return the carries of both folders in this one."""
+    """Return the benchmark of the machines in the subfolders of `folder`."""
     for file in (UR10E, PANDAS):
         if not (folder / file).is_file():
             raise OutsideError(f"{file} is not there")
@@ -98,7 +98,7 @@ def _two_pandas(xacro: Path) -> BenchmarkTask:
 
 
 def _pad(radius: float) -> dict[str, Any]:
-    """Return a pad on a rod in front of the flange."""
+    """Return the contact of a round pad of this radius [m] on a rod in front of the flange."""
     rod = {
         "kind": "cylinder",
         "radius": radius,

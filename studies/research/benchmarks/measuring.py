@@ -29,16 +29,17 @@ from symbolic.read.editing import completed
 from symbolic.safe_io import replace_file
 
 STUDY_EVALUATIONS = 1000
-"""Evaluations of the search behind a fastest carry."""
+"""Number of evaluations of the search for the fastest carry."""
 
 SHORT_EVALUATIONS, OFFSPRING = 4000, 20
-"""Evaluations behind a shortest one, in all and in a generation."""
+"""Number of evaluations of the search for the shortest carry, in all and per generation."""
 
 SHORT_STEP = 0.1
-"""Step with which the shortest one is looked for at first, as a share of the bounds."""
+"""First step size of the search for the shortest carry, as a share of the bounds."""
 
 CHECKS, TOGETHER = 4000, 200
-"""Configurations by which the rate of collision checks is measured: in all, and at once."""
+"""Number of configurations with which the rate of collision checks is measured, in all and per
+call."""
 
 PAD_FRICTION = 0.8
 """Friction of every pad."""
@@ -49,11 +50,12 @@ class BenchmarkTask:
     """One carry of a benchmark.
 
     Attributes:
-        name: for the table, and of its files.
-        problem: the problem file's tables.
-        length: of the others' shortest carry [rad], None where none was published.
-        straight: between the postures in which theirs begins and ends, in their coordinates [rad].
-        seconds: of the others' fastest carry, None where none was published.
+        name: of the task, in the table and in file names.
+        problem: tables of the problem file.
+        length: length of the published shortest carry [rad], None where none was published.
+        straight: straight distance between the published first and last postures, in the published
+            coordinates [rad].
+        seconds: duration of the published fastest carry [s], None where none was published.
     """
 
     name: str
@@ -65,14 +67,15 @@ class BenchmarkTask:
 
 @dataclass(frozen=True)
 class Benchmark:
-    """What somebody published.
+    """A set of published tasks.
 
     Attributes:
-        name: for the command line.
-        title: for the table.
+        name: on the command line.
+        title: in the table.
         tasks: the carries.
-        note: what was published beside lengths, and what is not comparable.
-        coordinates: theirs (n, m) of both arms' joints (n, joints) [rad]; all joints, else.
+        note: what else was published, and what cannot be compared.
+        coordinates: function from the joints (n, joints) of both arms to the published coordinates
+            (n, m) [rad]; None if these are all joints.
     """
 
     name: str
@@ -84,13 +87,13 @@ class Benchmark:
 
 @dataclass(frozen=True)
 class BenchmarkSource:
-    """Files of others, and the benchmark that they become.
+    """Published files, and how a benchmark is made of them.
 
     Attributes:
-        how: commands that fetch them, where FOLDER is what the command line names.
-        room: their folder in that.
-        make: the benchmark of that folder; an `OutsideError` tells what of it is not there, or not
-            theirs.
+        how: shell commands that fetch the files into FOLDER.
+        room: subfolder of FOLDER with the files.
+        make: function that returns the benchmark of that subfolder; it raises an `OutsideError` for
+            a missing or different file.
     """
 
     how: str
@@ -98,10 +101,10 @@ class BenchmarkSource:
     make: Callable[[Path], Benchmark]
 
     def benchmark(self, folder: Path) -> Benchmark:
-        """Return the benchmark.
+        """Return the benchmark of the files in a folder.
 
         Raises:
-            SettingsError: the files are not in FOLDER, or not those.
+            SettingsError: files are missing, or differ from the published ones.
         """
         there = folder / self.room
         try:
@@ -119,9 +122,17 @@ def carry_problem(
     scene: list[dict[str, Any]],
     **task: float,
 ) -> dict[str, Any]:
-    """Return the tables of a problem file: a carry that begins and ends in the air. `scene` is its
-    `[[environment]]`, `pads` are its `[[contacts]]` without friction, `ends` start and goal of
-    the box, `task` further keys of `[task]`."""
+    """Return the tables of a problem file for a carry that begins and ends in the air.
+
+    Args:
+        name: of the cell.
+        robots: tables `[[robots]]`.
+        payload: table `[payload]`.
+        pads: tables `[[contacts]]` without friction.
+        ends: start and goal pose of the box.
+        scene: tables `[[environment]]`.
+        task: further keys of `[task]`.
+    """
     return {
         "name": name,
         "robots": robots,
@@ -135,7 +146,7 @@ def carry_problem(
 
 @dataclass(frozen=True)
 class Length:
-    """Length of a carry, not finite where there is none.
+    """Length of a carry; not finite without a carry.
 
     Attributes:
         joints: over all joints of both arms [rad].
@@ -148,17 +159,18 @@ class Length:
 
 @dataclass(frozen=True)
 class TaskResult:
-    """A task's figures.
+    """Results of one task.
 
     Attributes:
-        task: which.
-        refused: why no carry was found, '' where one was.
-        held: whether the box can be held at start and goal.
-        workcell: the proposed file, None where there is none.
-        certified, seconds: worked until the first certified carry, and until its file was whole.
+        task: the task.
+        refused: why no carry was found, '' if one was.
+        held: True if the box can be held at start and goal.
+        workcell: the proposed workcell file, None without one.
+        certified, seconds: working time until the first certified carry, and until the file was
+            complete [s].
         first: length of the proposed carry.
-        fastest, shortest: of a study.
-        duration, force: of the fastest carry [s, N].
+        fastest, shortest: lengths of the fastest and the shortest carry of a study.
+        duration, force: duration [s] and commanded force [N] of the fastest carry.
     """
 
     task: BenchmarkTask
@@ -182,8 +194,8 @@ def measured(
     seed: int,
     study: bool,
 ) -> TaskResult:
-    """Propose a carry for one task, and look for the fastest and the shortest one where a study is
-    asked for; problem file and workcell go to the folder `output`."""
+    """Propose a carry for one task, and search for the fastest and the shortest carry if `study`.
+    The problem file and the workcell file are written to the folder `output`."""
     output.mkdir(parents=True, exist_ok=True)
     path = output / f"{benchmark.name}-{re.sub('[ /]', '-', task.name)}.toml"
     replace_file(path, completed("", {}, task.problem).encode())
@@ -214,9 +226,9 @@ def measured(
 
 
 def shortest_carry(workcell: Path, rng: np.random.Generator) -> ho.Carry:
-    """Find the carry with the shortest joint path by an evolution strategy, CMA-ES (Hansen, arXiv
-    1604.00772), starting at the cell's own one, within its bounds; it holds, is free of
-    collisions, also between its samples, and keeps the cell's largest force."""
+    """Return the carry of a cell with the shortest joint path that an evolution strategy finds
+    within the bounds, CMA-ES (Hansen, arXiv 1604.00772), started at the cell's initial trajectory.
+    The carry is certified free of collisions and keeps the cell's largest force."""
     cell = ho.Cell.load(workcell, ("joint_length",))
     task = cell.workcell.task
     lower, width = task.lower, task.upper - task.lower
@@ -243,13 +255,13 @@ def _joints(carry: ho.Carry) -> tuple[Array, Array]:
 
 
 def length(benchmark: Benchmark, q: tuple[Array, Array]) -> Length:
-    """Compute the length of the path of both arms' joints (n, joints)."""
+    """Return the length of the path of both arms' joints (n, joints)."""
     return Length(path_length(np.hstack(q)), path_length(benchmark.coordinates(*q)))
 
 
 def checks_per_second(workcell: Path, rng: np.random.Generator) -> float:
-    """Measure how many random configurations of both arms a cell's collision judge checks per
-    second of work, without compiled functions, as in a proposal."""
+    """Return the number of random configurations of both arms that the collision check of a
+    proposal decides per second of working time, without compiled functions."""
     cell = load(workcell)
     judge = judge_of(build_cell_bodies(cell))
     q_1, q_2 = (
@@ -281,10 +293,8 @@ BENCHMARK_FIGURES: tuple[tuple[str, Callable[[TaskResult], float | None], int], 
 
 
 def table(benchmark: Benchmark, found: list[TaskResult], rng: np.random.Generator) -> Table:
-    """Build a table of the figures and the published ones: work until the first certified carry and
-    until its file, its length over all joints and in their coordinates, in these also the
-    straight line between their ends; then a study's fastest carry and its shortest one. The note
-    gives the number found, and the rate of collision checks in the first one's cell."""
+    """Return the table of all results beside the published values. A note below states the number
+    of carries found, and the rate of collision checks in the first cell."""
     rows = tuple(
         (one.task.name, *(number(figure(one), digits) for _, figure, digits in BENCHMARK_FIGURES))
         for one in found
@@ -298,7 +308,7 @@ def table(benchmark: Benchmark, found: list[TaskResult], rng: np.random.Generato
 
 
 def solved(found: list[TaskResult]) -> str:
-    """Format the number of carries found, and the work until each verdict."""
+    """Return a text with the number of carries found, and the working times."""
     held = [one for one in found if one.held]
     times = sorted(one.certified for one in found if one.certified is not None)
     told = (

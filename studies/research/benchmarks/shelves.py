@@ -29,7 +29,7 @@ from symbolic.errors import OutsideError
 from symbolic.read.scenes import read_scene
 
 PACKAGE = "bimanual"
-"""What their URDF calls the folder."""
+"""Name of the published files' folder in their URDF."""
 
 BASE_DISTANCE = 0.765
 """Distance between both bases, along y [m]."""
@@ -41,7 +41,7 @@ STANDING = {
     "old_table/table_wide.sdf": np.array([0.4, 0.3825, 0.0]),
     "old_shelves.sdf": np.array([0.8, 0.3825, 0.0]),
 }
-"""Places of the scene's models [m]."""
+"""Positions of the scene's models by their file [m]."""
 
 SHELVES_PAD = 0.2
 """Distance from a last link to its pad: between palm and tip of their fingers [m]."""
@@ -61,14 +61,14 @@ GRIPPER: dict[str, Any] = {
     "xyz": [0.0, 0.0, 0.040867],
     "rpy": [np.pi / 2.0, 0.0, np.radians(68.0)],
 }
-"""The palm, as their SDF has it and their directives mount it."""
+"""Shape of the gripper's palm, from the published SDF and its mounting in the directives."""
 
 CARRIES = (
     ("top", "middle", 2.09),
     ("middle", "bottom", 3.32),
     ("bottom", "top", 5.62),
 )
-"""From, to, and the length that was published of IK-GCS [rad]."""
+"""For each carry its first shelf, its last shelf, and the published length with IK-GCS [rad]."""
 
 SHELVES_NOTE = (
     "Published: lengths of IK-GCS (arXiv 2309.08770), which plans in 2 to 3 s once regions are "
@@ -79,7 +79,7 @@ SHELVES_NOTE = (
 
 
 def benchmark(there: Path) -> Benchmark:
-    """Return the three carries of their folder."""
+    """Return the benchmark of three carries made from the published files in a folder."""
     given = postures(safe_io.read_bytes(there / "notebooks/main.ipynb", safe_io.WORKCELL_BYTES))
     urdf = there / "models/iiwa14_convex_decimated_collision.urdf"
     model = pin.buildModelFromUrdf(str(urdf))
@@ -109,11 +109,11 @@ def benchmark(there: Path) -> Benchmark:
 
 
 def postures(notebook: bytes) -> dict[str, Array]:
-    """Read the eight coordinates (8,) of the notebook by shelf: the left arm's joints, and the turn
-    of the right arm's elbow about the line from shoulder to wrist [rad].
+    """Return the postures in the published notebook by shelf, in eight coordinates (8,): the left
+    arm's joints, and the turn of the right arm's elbow about the line from shoulder to wrist [rad].
 
     Raises:
-        OutsideError: it is no notebook that has them.
+        OutsideError: the file is not a notebook with these postures.
     """
     try:
         cells = json.loads(notebook)["cells"]
@@ -128,10 +128,11 @@ def postures(notebook: bytes) -> dict[str, Array]:
 
 
 def coordinates(q_1: Array, q_2: Array) -> Array:
-    """Convert both arms' joints (n, 7) to their coordinates (n, 8), see `postures`.
+    """Convert the joints (n, 7) of both arms to the eight published coordinates (n, 8), which
+    `postures` describes.
 
-    The turn is counted from the plane through the arm's first axis. Where the wrist is on that axis
-    it is without meaning.
+    The elbow's turn is counted from the plane through the arm's first axis; it is meaningless if
+    the wrist lies on this axis.
     """
     return np.column_stack([q_1, np.unwrap([elbow_turn(q) for q in q_2])])
 
@@ -148,7 +149,7 @@ def elbow_turn(q: Array) -> float:
 
 
 def _box(model: pin.Model, q: Array) -> list[float]:
-    """Compute the box's pose at a posture of the left arm; the last link points along y."""
+    """Return the box pose for a posture of the left arm, whose last link points along y."""
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)
     hand = data.oMf[model.getFrameId("iiwa_link_7")]
@@ -180,7 +181,8 @@ def _robot(name: str, urdf: Path, folder: Path, y: float) -> dict[str, Any]:
 
 
 def _scene(models: Path) -> list[dict[str, Any]]:
-    """Return the table and shelves as bodies of a workcell."""
+    """Return the table and the shelves as bodies of a workcell, with meshes in the folder
+    `models`."""
     return [
         {**table, "xyz": (np.array(table["xyz"]) + at).tolist()}
         for name, at in STANDING.items()

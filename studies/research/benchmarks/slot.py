@@ -30,10 +30,10 @@ PLATE = (0.6, 0.2, 0.02)
 
 SLOT_START = [0.0, -0.45, 0.876, 0.0, 0.0, 0.0]
 GOAL = [0.0, -0.65, 1.051, -np.pi / 2.0, 0.0, 0.0]
-"""Lying on the riser, and standing in the slot, a millimetre of air below [m, rad]."""
+"""Poses of the plate on the riser and in the slot, each with a millimetre of air below [m, rad]."""
 
 ARM_PLACES = {"left": (0.375, -105.0), "right": (-0.375, -75.0)}
-"""Places along x [m] and yaw [degrees], on the table."""
+"""Position along x [m] and yaw [degrees] of both arms on the table."""
 
 SLOT_TABLE = {"name": "table", "kind": "box", "size": [1.7, 1.3, 0.04], "xyz": [0.0, -0.35, 0.7299]}
 
@@ -56,8 +56,8 @@ SPEED_LIMITS: tuple[tuple[str, dict[str, float], float], ...] = (
         8.96,
     ),
 )
-"""What bounds the speed beside the arms, and the published time to the goal [s]: their planner
-bounds the plate's speed in both cases."""
+"""Limits besides those of the arms, each with the published time to the goal [s]. The published
+planner limits the plate's speed in both cases."""
 
 JOINTS = {
     "position_lower": [-2.7973, -1.6628, -2.7973, -2.9718, -2.7973, 0.0825, -2.7973],
@@ -80,7 +80,8 @@ SLOT_NOTE = (
 
 
 def benchmark(there: Path) -> Benchmark:
-    """Return the carry of their folder, within three kinds of limits."""
+    """Return the benchmark made from the published files in a folder: one carry within three sets
+    of limits."""
     content = safe_io.read_bytes(there / "models/scene_slot_gate.xml", safe_io.URDF_BYTES)
     scene = [SLOT_TABLE, *bodies(safe_io.text(content))]
     tasks = []
@@ -103,10 +104,10 @@ def benchmark(there: Path) -> Benchmark:
 
 
 def bodies(scene: str) -> Iterator[dict[str, Any]]:
-    """Convert the still boxes of a scene to bodies of a workcell.
+    """Yield the fixed boxes of a published scene as bodies of a workcell.
 
     Raises:
-        OutsideError: it is no such scene.
+        OutsideError: the text is not such a scene.
     """
     found = 0
     for body in parse_elements(scene, "mujoco").iterfind("worldbody/body"):
@@ -127,7 +128,7 @@ def bodies(scene: str) -> Iterator[dict[str, Any]]:
 
 
 def _numbers(text: str | None) -> list[float]:
-    """Read the three numbers of an attribute."""
+    """Return the three numbers in an attribute's text."""
     try:
         found = [float(each) for each in (text or "").split()]
     except ValueError:

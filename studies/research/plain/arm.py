@@ -24,8 +24,8 @@ from symbolic.robot.arm import (
 
 
 def held_model(robot: Robot) -> tuple[pin.Model, list[int], Array]:
-    """Return the model of the whole description, the joints that do not move, and their
-    positions."""
+    """Return Pinocchio's model of a robot's whole description, the indices of the joints that do
+    not move, and their positions."""
     urdf = read_urdf(robot.urdf, robot.xacro_arguments, robot.package_dirs)
     moving = moving_joints(urdf, robot.chain_root, robot.flange, robot.locked_joints)
     model = pin.buildModelFromXML(urdf.kinematics)
@@ -38,12 +38,12 @@ def held_model(robot: Robot) -> tuple[pin.Model, list[int], Array]:
 
 
 class PlainArm:
-    """The numeric model of an arm and the pad that it holds the box with.
+    """Numeric model of an arm that holds the box with its pad.
 
     Args:
-        robot, contact: the arm and what it holds the box by.
+        robot, contact: the arm, and its contact with the box.
         redundant: indices of the joints that do not follow the box.
-        orientation: what the last three numbers of poses mean; roll, pitch, yaw by default.
+        orientation: convention of the last three numbers of poses.
     """
 
     def __init__(
@@ -71,20 +71,23 @@ class PlainArm:
         return self.T_root_world * world_pad * self.T_flange_pad.inverse()
 
     def place(self, q: Array) -> pin.SE3:
-        """Compute the flange placement in the root; leaves the frames of `data` up to date."""
+        """Compute the flange placement in the root frame. The frames in `data` are up to date
+        afterwards."""
         pin.forwardKinematics(self.model, self.data, q)
         pin.updateFramePlacements(self.model, self.data)
         return self.data.oMf[self.flange]
 
     def jacobian(self, q: Array) -> Array:
-        """Compute the Jacobian (6, n) of the flange, linear rows first, axes of the root."""
+        """Compute the Jacobian (6, n) of the flange along the axes of the root frame, linear rows
+        first."""
         J: Array = pin.computeFrameJacobian(
             self.model, self.data, q, self.flange, pin.LOCAL_WORLD_ALIGNED
         )
         return J
 
     def newton_step(self, q: Array, target: pin.SE3) -> Array:
-        """Compute one Newton step, shortened to `MAX_JOINT_STEP`; none at a singular posture."""
+        """Return one Newton step (n,), shortened to `MAX_JOINT_STEP`; zero in a singular
+        posture."""
         here = self.place(q)
         turn = Rotation.from_matrix(target.rotation @ here.rotation.T).as_rotvec()
         angle = float(np.linalg.norm(turn))
@@ -102,8 +105,8 @@ class PlainArm:
         return moved
 
     def residual(self, q: Array, target: pin.SE3) -> float:
-        """Compute the distance and twice the sine of half the angle between placement and target,
-        joined."""
+        """Return the pose residual of joints q (n,): the norm of distance [m] and of twice the sine
+        of half the angle between placement and target."""
         here = self.place(q)
         angle = Rotation.from_matrix(target.rotation @ here.rotation.T).magnitude()
         distance = np.linalg.norm(target.translation - here.translation)
@@ -112,11 +115,15 @@ class PlainArm:
     def search(
         self, previous: Array, change: Array, curve: Array, target: pin.SE3, values: Array
     ) -> Array:
-        """Compute joints (n,) for the next target by Newton's method from the joints before.
+        """Return joint positions (n,) for the next target, by Newton's method from an extrapolation
+        of the previous ones.
 
         Args:
-            change, curve: (n,) the last difference of the joints, and its difference.
-            values: of the redundant joints.
+            previous: (n,) previous joint positions.
+            change, curve: (n,) last difference of the joint positions, and last difference of this
+                difference.
+            target: placement of the flange.
+            values: positions of the redundant joints.
         """
         q, before = previous + change + curve, 0.0
         q[self.redundant] = values
@@ -134,7 +141,8 @@ class PlainArm:
         return min(q, other, key=lambda found: self.residual(found, target))
 
     def begin(self, start: Array, pose: Array, values: Array) -> Array:
-        """Move the redundant joints of the start posture evenly to their first positions."""
+        """Return the start posture after an even motion of the redundant joints to their positions
+        at the first sample."""
         q, change = start.copy(), np.zeros(len(start))
         change[self.redundant] = (values - start[self.redundant]) / BEGIN_STEPS
         for _ in range(BEGIN_STEPS if self.redundant else 0):
@@ -144,13 +152,14 @@ class PlainArm:
     def follow(
         self, start: Array, poses: Array, wrenches: Array, values: Array | None = None
     ) -> dict[str, Array]:
-        """Compute every output of `symbolic.robot.arm.TRACK_OUTPUTS` along the samples.
+        """Return all outputs of `symbolic.robot.arm.TRACK_OUTPUTS` along the samples.
 
         Args:
-            start: (joints,) at the first pose [rad or m].
-            poses: (n, 6) of the box.
-            wrenches: (n, 6) on the box about the nominal contact point, world axes.
-            values: (n, k) of the redundant joints.
+            start: (joints,) joint positions at the first pose [rad or m].
+            poses: (n, 6) box poses [m, rad].
+            wrenches: (n, 6) wrenches on the box about the nominal contact point, world axes [N, N
+                m].
+            values: (n, k) positions of the redundant joints [rad or m]; None without any.
         """
         values = np.zeros((len(poses), 0)) if values is None else values
         previous = self.begin(start, poses[0], values[0])

@@ -83,7 +83,7 @@ class PlainEvaluator:
         return PlainCandidate(outputs, names, next((each[0] for each in here if each), ""))
 
     def _constraints(self, outputs: dict[str, Array], k: int) -> list[float]:
-        """Compute values of `CONSTRAINTS` at sample k."""
+        """Return the values of all `CONSTRAINTS` at sample k."""
         workcell, values = self.workcell, {}
         friction = []
         for i, contact in enumerate(workcell.contacts):
@@ -108,7 +108,7 @@ class PlainEvaluator:
 
 
 def _violated(constraint: Array) -> list[list[str]]:
-    """Return the violated constraints of each sample, in order."""
+    """Return the names of the violated constraints of each sample, in order."""
     return [
         [name for name, value in zip(CONSTRAINTS, values, strict=True) if value > 0.0]
         for values in constraint
@@ -122,17 +122,16 @@ def evaluate(workcell: Workcell, start: tuple[Array, Array], x: Array) -> PlainC
 
 @dataclass(frozen=True)
 class PlainVerdict:
-    """Verdict of the plain reference on a candidate with collisions.
+    """Verdict of the plain reference on a candidate, collisions included.
 
     Attributes:
-        candidate: everything but the collisions.
-        collisions: on the samples that both arms reach.
-        objectives: (2,) the paper's peak normal forces over the reference forces.
-        feasible: whether no constraint is violated and nothing collides.
-        reason: what is violated first along the path: one of `CONSTRAINTS`, "collision", or an
-            empty string.
-        position: path parameter of the first violation; NaN where feasible.
-        violation_time: time in violation over the duration, per name of those reasons.
+        candidate: verdict without collisions.
+        collisions: collisions at the samples that both arms reach.
+        objectives: (2,) peak normal forces over the reference forces.
+        feasible: True if no constraint is violated and no bodies collide.
+        reason: first violation along the path: one of `CONSTRAINTS` or "collision", '' if feasible.
+        position: path parameter of the first violation, NaN if feasible.
+        violation_time: time in violation over the duration, by the name of the violation.
     """
 
     candidate: PlainCandidate

@@ -29,11 +29,11 @@ PAYLOAD_GROUP = "payload"
 
 @dataclass(frozen=True)
 class PlainCollisions:
-    """FCL's verdict on the samples of a candidate.
+    """Collisions at the samples of a candidate, as FCL finds them.
 
     Attributes:
-        colliding: (n,) samples in which some pair collides.
-        pairs: per sample the names of the pairs that collide.
+        colliding: (n,) True for samples with a collision.
+        pairs: per sample the names of the colliding pairs.
         time: time in collision [s].
     """
 
@@ -44,7 +44,7 @@ class PlainCollisions:
 
 @dataclass
 class _Solid:
-    """An FCL object and its placement in the frame that carries it."""
+    """An FCL object, and its placement in the frame of its link or body."""
 
     object: fcl.CollisionObject
     placement: pin.SE3
@@ -55,7 +55,7 @@ class _Solid:
 
 
 class PlainCollisionChecker:
-    """FCL objects of every body of a workcell."""
+    """FCL objects of all bodies of a workcell."""
 
     def __init__(self, workcell: Workcell) -> None:
         self.workcell = workcell
@@ -72,11 +72,17 @@ class PlainCollisionChecker:
 
     @cached_property
     def pairs(self) -> tuple[tuple[str, str], ...]:
-        """Names of the bodies that are checked against one another."""
+        """Names of the bodies of all pairs that are checked."""
         return build_geometry(self.workcell).pair_names
 
     def check(self, time: Array, pose: Array, q_1: Array, q_2: Array) -> PlainCollisions:
-        """Check every pair of n samples: time (n,), box pose and joints (n, 6) each."""
+        """Check all pairs at n samples.
+
+        Args:
+            time: (n,) times [s].
+            pose: (n, 6) box poses [m, rad].
+            q_1, q_2: (n, joints) joint positions of each arm [rad or m].
+        """
         found = []
         for k in range(len(time)):
             self.arms[0].move(q_1[k])
@@ -104,8 +110,8 @@ class PlainCollisionChecker:
         return hit
 
     def _tolerance(self, of_payload: bool) -> float:
-        """Compute the distance up to which bodies collide [m]: displaced pads have the payload
-        elsewhere."""
+        """Return the distance up to which two bodies count as colliding [m]. For the payload it
+        includes the uncertain position of the pads."""
         doubt = self.workcell.uncertainty
         displaced = doubt.pad_position if of_payload and doubt.stated else 0.0
         return self.workcell.collision.tolerance + displaced
@@ -116,7 +122,8 @@ class PlainCollisionChecker:
             solid.move(world_box)
 
     def _resting_places(self) -> list[tuple[str, Array, float]]:
-        """Return body, place and departure of every allowed contact that a fixed pose makes."""
+        """Return every allowed contact at a fixed pose: the body, the position of the payload, and
+        the distance within which contact is allowed [m]."""
         task, places = self.workcell.task, []
         for waypoint in task.waypoints:
             if not waypoint.is_fixed:
@@ -130,7 +137,8 @@ class PlainCollisionChecker:
         return places
 
     def _allowed(self, centre: Array) -> set[str]:
-        """Return the bodies that the payload may touch with its centre here."""
+        """Return the names of the bodies that the payload may touch with its centre at this
+        position (3,)."""
         return {
             body
             for body, place, departure in self.resting
@@ -139,7 +147,7 @@ class PlainCollisionChecker:
 
 
 class _Arm:
-    """The links and tools of a robot, moved by numeric Pinocchio."""
+    """Links and tools of a robot, moved by numeric Pinocchio."""
 
     def __init__(self, robot: Robot) -> None:
         self.base = pin.SE3(robot.T_world_base)
@@ -172,7 +180,7 @@ class _Arm:
 
 
 def _urdf_shape(item: pin.GeometryObject) -> Shape | coal.Capsule:
-    """Convert the shape of a link as Pinocchio read it."""
+    """Convert a link's shape as Pinocchio read it to a shape of this project."""
     shape = item.geometry
     match shape:
         case coal.Box():

@@ -17,11 +17,13 @@ from symbolic.records import Task, Workcell
 from symbolic.records.poses import Orientation
 
 NODES = 14
-"""Nodes of Gauss's quadrature: exact to rounding up to a full turn."""
+"""Number of nodes of Gauss's quadrature, which is then exact up to rounding for rotations up to a
+full turn."""
 
 
 def waypoints(task: Task, x: Array) -> Array:
-    """Compute all waypoints (n_waypoints, 6) of a decision vector, angles unwrapped."""
+    """Return all waypoints (n_waypoints, 6) of a decision vector, with unwrapped angles [m,
+    rad]."""
     free = iter(np.reshape(x[: task.n_box], (-1, 6)))
     rows = np.array([w.lower if w.is_fixed else next(free) for w in task.waypoints])
     rows[:, 3:] = task.orientation.unwrapped(rows[:, 3:])
@@ -29,7 +31,7 @@ def waypoints(task: Task, x: Array) -> Array:
 
 
 def redundant_path(task: Task, x: Array) -> Array:
-    """Compute values (samples, m) of the redundant joints of a decision vector."""
+    """Return the positions (samples, m) of the redundant joints of a decision vector."""
     free = iter(x[task.n_box :])
     columns = [
         [low if low == high else next(free) for low, high in zip(j.lower, j.upper, strict=True)]
@@ -77,7 +79,8 @@ def natural_quintic(points: Array) -> Array:
 
 
 def evaluate_spline(coefficients: Array, u: float, order: int = 0) -> Array:
-    """Evaluate a derivative of some order with respect to u in [0, 1] over the whole spline."""
+    """Return the derivative of an order of a spline, with respect to u in [0, 1] over the whole
+    spline."""
     segments = len(coefficients)
     k = min(int(u * segments), segments - 1)
     value: Array = _powers(u * segments - k, order) @ coefficients[k] * segments**order
@@ -85,7 +88,7 @@ def evaluate_spline(coefficients: Array, u: float, order: int = 0) -> Array:
 
 
 def _powers(s: float, order: int) -> Array:
-    """Compute the derivative of (1, s, ..., s^5)."""
+    """Return the derivative of an order of (1, s, ..., s^5)."""
     return np.array(
         [
             factorial(p) / factorial(p - order) * s ** (p - order) if p >= order else 0.0
@@ -101,7 +104,8 @@ def rotation(rpy: Array) -> Array:
 
 
 def box_rotation(orientation: Orientation, numbers: Array) -> Array:
-    """Compute R_world_box (3, 3) in the cell's convention."""
+    """Compute R_world_box (3, 3) from the last three numbers of a pose, in the cell's
+    convention."""
     if not orientation.is_vector:
         return rotation(numbers)
     turn: Array = Rotation.from_rotvec(numbers).as_matrix()
@@ -109,16 +113,17 @@ def box_rotation(orientation: Orientation, numbers: Array) -> Array:
 
 
 def euler_axes(rpy: Array) -> tuple[Array, Array, Array]:
-    """Compute the world axes about which roll, pitch and yaw turn, in this order."""
+    """Return the world axes (3,) of the rotations by roll, pitch and yaw, in this order."""
     yaw = Rotation.from_euler("z", rpy[2])
     pitch = Rotation.from_euler("ZY", [rpy[2], rpy[1]])
     return pitch.apply([1.0, 0.0, 0.0]), yaw.apply([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
 
 
 def angular_rates(rpy: Array, rate: Array, second: Array) -> tuple[Array, Array]:
-    """Compute angular velocity and acceleration (3,) in the world frame of roll, pitch, yaw.
+    """Compute angular velocity and acceleration (3,) in the world frame from roll, pitch, yaw and
+    their derivatives.
 
-    Each axis is carried round by the turns outside it: d axis / dt = omega_outer x axis.
+    Each axis is rotated by the rotations outside it: d axis / dt = omega_outer x axis.
     """
     roll_axis, pitch_axis, yaw_axis = euler_axes(rpy)
     yaw_rate, pitch_rate, roll_rate = rate[2] * yaw_axis, rate[1] * pitch_axis, rate[0] * roll_axis
@@ -133,10 +138,12 @@ def angular_rates(rpy: Array, rate: Array, second: Array) -> tuple[Array, Array]
 
 
 def vector_rates(vector: Array, rate: Array, second: Array) -> tuple[Array, Array]:
-    """Compute angular velocity and acceleration (3,) in the world frame of a rotation vector.
+    """Compute angular velocity and acceleration (3,) in the world frame from a rotation vector and
+    its derivatives.
 
-    omega = integral of exp(s v) v' over s in [0, 1]; exp(s v) itself turns with the same integral
-    up to s (Chirikjian, Stochastic Models, Information Theory, and Lie Groups 2, 2012, 10.7).
+    omega is the integral of exp(s v) v' over s in [0, 1]; exp(s v) itself rotates with the same
+    integral up to s (Chirikjian, Stochastic Models, Information Theory, and Lie Groups 2, 2012,
+    10.7).
     """
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
     shares, weights = (nodes + 1.0) / 2.0, weights / 2.0
@@ -150,12 +157,13 @@ def vector_rates(vector: Array, rate: Array, second: Array) -> tuple[Array, Arra
 def box_rates(
     orientation: Orientation, numbers: Array, rate: Array, second: Array
 ) -> tuple[Array, Array]:
-    """Compute angular velocity and acceleration (3,) in the cell's convention."""
+    """Compute angular velocity and acceleration (3,) in the world frame from the last three numbers
+    of a pose and their derivatives, in the cell's convention."""
     return (vector_rates if orientation.is_vector else angular_rates)(numbers, rate, second)
 
 
 def timed_motion(task: Task, x: Array) -> tuple[Array, Array, Array, Array]:
-    """Time (n,), pose (n, 6), its rate and second rate (n, 6) of a candidate."""
+    """Return time (n,) [s], pose, rate and second rate (n, 6) of a candidate."""
     coefficients = natural_quintic(waypoints(task, x))
     u = np.linspace(0.0, 1.0, task.samples)
     pose = np.array([evaluate_spline(coefficients, value) for value in u])
@@ -209,7 +217,8 @@ def _ramped(
 
 
 def drive(task: Task, length: float, total: float) -> tuple[float, float, float]:
-    """Time, speed and acceleration where a rest-to-rest drive has covered a length."""
+    """Return time, speed and acceleration at which a motion from rest to rest, of the length
+    `total`, has covered `length`."""
     ramp, cruise = task.ramp_time, min(task.reference_speed, total / task.ramp_time)
     duration = ramp + total / cruise
     if length > total / 2.0:
@@ -227,7 +236,7 @@ PLAIN_GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
 def sample_load(workcell: Workcell, pose: Array, rate: Array, second: Array) -> dict[str, Array]:
-    """Compute every load quantity of one sample, named as in `LOAD_OUTPUTS`."""
+    """Return all load quantities of one sample, by the names in `LOAD_OUTPUTS`."""
     payload, contacts = workcell.payload, workcell.contacts
     orientation = workcell.task.orientation
     R = box_rotation(orientation, pose[3:])
@@ -269,8 +278,8 @@ def sample_load(workcell: Workcell, pose: Array, rate: Array, second: Array) -> 
 
 
 def allocate(f_n: float, f_t: float, friction: tuple[float, float]) -> tuple[Array, Array]:
-    """Compute the least-effort normal forces (2,) and tangential shares (2,) of a resultant force
-    [N]."""
+    """Return the least-effort normal forces (2,) and tangential shares (2,) for a resultant force
+    with normal component f_n and tangential magnitude f_t [N]."""
     if friction[0] == friction[1]:
         return _equal_friction(f_n, f_t, friction[0])
     return _small_program(f_n, f_t, friction)
@@ -285,7 +294,7 @@ def _equal_friction(f_n: float, f_t: float, mu: float) -> tuple[Array, Array]:
 
 
 def _small_program(f_n: float, f_t: float, friction: tuple[float, float]) -> tuple[Array, Array]:
-    """Solve the quadratic program in N_1, N_2, t_1, t_2, by trying every set of active
+    """Solve the quadratic program in N_1, N_2, t_1, t_2 by trying all sets of active
     constraints."""
     equal = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
     # Rows that must not be positive: both friction cones, both normal forces.
