@@ -429,6 +429,8 @@ def _contact(
         twist=take(HELD, f"{path} twist", patch.twist),
         spread=take(HELD, f"{path} spread", patch.spread),
         holding_force=0.0,
+        layer_shear=0.0,
+        layer_stiffness=0.0,
         **{name: take(HELD, f"{path} {name}", value) for name, value in hand.items()},
     )
 

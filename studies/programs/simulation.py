@@ -36,7 +36,13 @@ from hybrid_opt.extras.simulation.box import (
     planned_moments,
     workcell_of_case,
 )
-from hybrid_opt.extras.simulation.hands import HAND_SETTINGS, HandSimulation, swing_frequency
+from hybrid_opt.extras.simulation.hands import (
+    HAND_SETTINGS,
+    HandSimulation,
+    hand_threshold,
+    own_forces,
+    swing_frequency,
+)
 from hybrid_opt.extras.simulation.reference import (
     Control,
     Reference,
@@ -158,10 +164,6 @@ CREEP_FACTOR = 1.05
 
 USUAL_CONTROLLER: Control = "leader"
 
-HANDS_LOW = 0.5
-"""Factor at which hands should lose the payload; other hands take over the share of one that
-slips."""
-
 
 def simulate_pads(
     cell: Cell, carry: Carry, settings: SimulationSettings, options: argparse.Namespace
@@ -208,13 +210,11 @@ def simulate_hands(
 ) -> None:
     """Find the threshold of a carry in hands, simulate random cases, and print both."""
     workcell = cell.workcell
-    planned, motion = carry.peak_normal_force, carriage_motion(carry, settings)
     print(
         f"  without arms; the payload swings at {swing_frequency(workcell, settings):.1f} Hz on "
         "layers of rubber"
     )
-    simulate = partial(HandSimulation(workcell, settings).simulate, motion, planned)
-    found = bisected(simulate, HANDS_LOW, HIGH, PAD_BISECTIONS)
+    found = hand_threshold(carry, settings)
     slips = found.slips
     what = "a rim lifts" if slips.lifts else f"one slips beyond {1e3 * settings.slip:g} mm"
     print(
@@ -224,7 +224,7 @@ def simulate_hands(
     if workcell.uncertainty.is_empty:
         return
     forces, squeeze = commanded_forces(workcell, carry, SqueezeSettings(leader=options.leader - 1))
-    holding = forces.max(axis=0)
+    holding, motion = own_forces(workcell, forces.max(axis=0)), carriage_motion(carry, settings)
     rng = np.random.default_rng(options.seed)
     cases = random_cases(workcell, workcell.uncertainty, options.runs, rng)
     held = np.zeros(2, dtype=int)

@@ -22,12 +22,21 @@ from hybrid_opt.campaign.settings import (
     polished_selected_file,
 )
 from hybrid_opt.campaign.stages import Cells, cells_of, ready_cells
+from hybrid_opt.carry import Carry
 from hybrid_opt.display.table import Table, number
 from hybrid_opt.errors import ResultsError, SimulationError
 from hybrid_opt.extras.simulation.arms import CarrySimulation, CellSimulation, simulate_carry
+from hybrid_opt.extras.simulation.box import carriage_motion
+from hybrid_opt.extras.simulation.hands import (
+    HAND_SETTINGS,
+    HandSimulation,
+    hand_threshold,
+    own_forces,
+)
 from hybrid_opt.extras.simulation.reference import Control, driven_carry
 from hybrid_opt.metaheuristics.run import title
 from hybrid_opt.progress import Progress
+from hybrid_opt.robust.squeeze import SqueezeSettings, commanded_forces
 from hybrid_opt.store.files import read_bytes, read_record, sha256, to_json, write_json
 from hybrid_opt.store.trajectory_file import StoredTrajectory, read_trajectory
 from hybrid_opt.timing.analysis import (
@@ -40,6 +49,7 @@ from hybrid_opt.timing.records import TimingStatus
 from studies.study.recommendation import StoredRecommendation
 from studies.study.summary import read_summary
 from symbolic.array import Array, Figure, Row, Shape, evenly
+from symbolic.contact.registry import contact_model
 from symbolic.errors import SettingsError
 
 MOST_SAMPLES = 240
@@ -245,10 +255,37 @@ def _simulated(one: SimulationRequest) -> StoredSimulation:
         cell = one.trajectory.open_cell(Path(folder))
         try:
             carry = driven_carry(cell, one.trajectory.x)
+            if not contact_model(cell.workcell).is_squeeze:
+                return _simulated_hands(carry, *whose)
             found = simulate_carry(cell, carry, CellSimulation(cell.workcell), CONTROL)
         except (SimulationError, SettingsError) as error:
             return StoredSimulation(*whose, problem=str(error))
         return stored_simulation(found, *whose)
+
+
+def _simulated_hands(
+    carry: Carry, label: str, trajectory: str, controller: str
+) -> StoredSimulation:
+    """Find the threshold of a carry in hands without arms, and simulate it with the robust
+    forces."""
+    threshold, workcell = hand_threshold(carry), carry.workcell
+    robust = commanded_forces(workcell, carry, SqueezeSettings(), itemised=False)[0].max(axis=0)
+    motion = carriage_motion(carry, HAND_SETTINGS)
+    shown = HandSimulation(workcell).simulate(motion, own_forces(workcell, robust))
+    return StoredSimulation(
+        label,
+        trajectory,
+        controller,
+        problem="",
+        duration=carry.duration,
+        slips=threshold.slips.factor,
+        holds=threshold.holds.factor,
+        pad=threshold.slips.pad + 1,
+        begins=float(threshold.slips.time[-1] - motion.time[0]) - HAND_SETTINGS.settle,
+        robust=True,
+        arrives=shown.holds,
+        slip=float(shown.slip.max()),
+    )
 
 
 TIMING = "timing"

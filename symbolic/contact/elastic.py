@@ -23,9 +23,6 @@ from symbolic.array import Array
 from symbolic.contact.force_closure import wrench_to_box
 from symbolic.records import Contact, Workcell
 
-SHEAR = 1.0 / 3.0
-"""Tangential stiffness of a layer over its normal stiffness. Rubber keeps its volume."""
-
 
 def layer_shares(pads: Sequence[Contact]) -> Array:
     """Compute the matrices (n, 6, 6) that map a load to the wrenches of n pads.
@@ -87,5 +84,7 @@ def layer_stiffness(pad: Contact) -> Array:
     else:
         squares = [side * shift for side, shift in zip(pad.half_sides, kern(pad), strict=True)]
     x_squared, y_squared = squares
-    torsion = SHEAR * (x_squared + y_squared)
-    return area * np.diag([SHEAR, SHEAR, 1.0, y_squared, x_squared, torsion])
+    along = pad.layer_shear
+    torsion = along * (x_squared + y_squared)
+    area = area * pad.layer_stiffness
+    return area * np.diag([along, along, 1.0, y_squared, x_squared, torsion])

@@ -139,6 +139,9 @@ def read_contact(table: TableReader, payload: Payload) -> Contact:
         table.add(
             "holding_force", "found for a pad; allowed with kind = 'cup', 'magnet', 'fingers'"
         )
+    layer = {key: getattr(Contact, key) for key in ("layer_shear", "layer_stiffness")}
+    if kind != "pad":
+        layer = {key: table.number(key, quantity.LAYER, usual) for key, usual in layer.items()}
     if kind == "cup" and half_sides is not None:
         table.add("patch_size", "found for a cup; allowed is the patch_radius of its lip")
     known = table.clean("patch_radius", "patch_size") and table.problems.clean(*SHAPE_KEYS)
@@ -146,7 +149,7 @@ def read_contact(table: TableReader, payload: Payload) -> Contact:
     def pad(place: TableReader, further: tuple[Contact, ...] = ()) -> Contact:
         pose = _read_place(place, payload if known else None, radius, half_sides)
         place.close()
-        return Contact(pose, friction, radius, half_sides, further, kind, force)
+        return Contact(pose, friction, radius, half_sides, further, kind, force, **layer)
 
     return pad(table, tuple(pad(entry) for entry in table.tables("further")))
 

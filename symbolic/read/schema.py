@@ -126,6 +126,8 @@ def _contact() -> Schema:
         "further": _with("other pads or hands of the same robot", further),
         "kind": _with("a pad, or a hand that holds by itself", _words(get_args(HandKind))),
         "holding_force": _with("of each such hand [N]", _number(quantity.FORCE)),
+        "layer_shear": _with("of its layer, along over across", _number(quantity.LAYER)),
+        "layer_stiffness": _with("of its layer over that of others", _number(quantity.LAYER)),
     }
     return _table(keys, ("friction",))
 

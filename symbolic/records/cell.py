@@ -290,6 +290,9 @@ class Contact:
             patch.
         holding_force: own holding force of a hand: vacuum times area, pull of a magnet, closing
             force of a gripper [N]; zero for a pad.
+        layer_shear: stiffness of the elastic layer along the patch over that normal to it; the
+            default is that of rubber, which keeps its volume.
+        layer_stiffness: normal stiffness per area over that of other layers.
     """
 
     T_box_pad: Array
@@ -299,6 +302,8 @@ class Contact:
     further: tuple[Contact, ...] = ()
     kind: HandKind = "pad"
     holding_force: float = 0.0
+    layer_shear: float = 1.0 / 3.0
+    layer_stiffness: float = 1.0
 
     @property
     def is_ring(self) -> bool:

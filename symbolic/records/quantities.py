@@ -46,6 +46,7 @@ FRICTION = Range(1e-3, 5.0, mistaken=(("%", 1e-2),))
 PATCH_RADIUS = Range(1e-4, 0.5, "m", mistaken=_MILLIMETRES)
 PATCH_SIDE = Range(2e-4, 1.0, "m", mistaken=_MILLIMETRES)
 
+LAYER = Range(0.01, 100.0)
 SHARE = Range(0.0, 0.9, mistaken=(("%", 1e-2),))
 DISPLACEMENT = Range(0.0, 0.5, "m", mistaken=_MILLIMETRES)
 DISTURBANCE = Range(0.0, 50.0, "m/s^2", mistaken=(("mm/s^2", 1e-3),))

@@ -3,9 +3,9 @@
 The carriage moves as planned and has one body per hand: a cup on bellows, a magnet, or a finger on
 its rubber. The hand's lip is a set of points, each a spring normal to the patch; between the lip
 and the carriage the layer yields along the patch and about its normal. Both form one elastic layer,
-with the normal stiffness `ContactSettings.layer` per area and a third of it along the patch, equal
-for all hands. The holding force is the pull of an adhesion actuator on the payload, and hands are
-placed such that it compresses their layers.
+with the normal stiffness `ContactSettings.layer` per area times `Contact.layer_stiffness`, and
+`Contact.layer_shear` of that along the patch. The holding force is the pull of an adhesion actuator
+on the payload, and hands are placed such that it compresses their layers.
 
 The sharing of a load among hands, the sliding of a point and the pressure at a rim follow from
 these springs and Coulomb's law at each point. A planned carry contributes only its motion.
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 from copy import copy
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -23,10 +23,14 @@ from numpy.typing import ArrayLike
 from scipy.linalg import block_diag, eigh
 from scipy.spatial.transform import Rotation
 
+from hybrid_opt.carry import Carry
 from hybrid_opt.extras.simulation.box import (
     SLIP_INTERVAL,
     CarriageMotion,
     Outcome,
+    Threshold,
+    bisected,
+    carriage_motion,
     mujoco_module,
 )
 from hybrid_opt.extras.simulation.scene import (
@@ -38,7 +42,7 @@ from hybrid_opt.extras.simulation.scene import (
     rim,
 )
 from symbolic.array import Array
-from symbolic.contact.elastic import SHEAR, layer_stiffness
+from symbolic.contact.elastic import layer_stiffness
 from symbolic.contact.force_closure import wrench_to_box
 from symbolic.contact.registry import contact_model
 from symbolic.errors import SettingsError
@@ -68,6 +72,12 @@ ring."""
 RIM_PLACES = 32
 """Number of points on a hand's rim at which slip and lift are measured."""
 
+LOW_FACTOR, HIGH_FACTOR = 0.5, 2.0
+"""Multiples of the planned forces with which hands lose the payload, and hold it. Other hands take
+over a part of the share of one that slips."""
+
+FACTOR_BISECTIONS = 9
+"""Number of bisections between them, to about 0.3 %."""
 
 HAND_JOINTS = ("x", "y", "turn")
 """Names of the joints of a hand on its layer."""
@@ -139,7 +149,7 @@ class HandSimulation:
         model = copy(self._model())
         hands = self._hands
         force = factor * np.broadcast_to(holding_force, 2)[list(self.workcell.pad_robots)]
-        stiffness = np.array([settings.layer * hand.area for hand in hands])
+        stiffness = np.array([_normal_stiffness(hand, settings) * hand.area for hand in hands])
         for k, hand in enumerate(hands):
             depth = max(0.0, force[k]) / stiffness[k]
             model.body(f"hand_{k}").pos[:] = hand.T_box_pad[:3, 3] + depth * hand.T_box_pad[:3, 2]
@@ -186,6 +196,30 @@ class HandSimulation:
         )
         text = carriage_text(self.workcell, settings, self._disturbance, hands, pulls)
         return compiled(self._mujoco, text, LIP_DAMPING)[0]
+
+
+def own_forces(workcell: Workcell, forces: Array) -> Array:
+    """Return the forces (2,) of either arm's hands, from forces (2,) that are stated for the weaker
+    hands of both [N]."""
+    own = np.array([contact.holding_force for contact in workcell.contacts])
+    return np.asarray(forces * own / own.min())
+
+
+def hand_threshold(
+    carry: Carry, settings: SimulationSettings = HAND_SETTINGS
+) -> Threshold[HandOutcome]:
+    """Find the least multiple of a carry's planned forces with which no hand slips and no rim
+    lifts.
+
+    Raises:
+        SimulationError: MuJoCo is not installed, or no multiple between `LOW_FACTOR` and
+            `HIGH_FACTOR` separates both.
+        SettingsError: the pads press the payload between them.
+    """
+    planned = own_forces(carry.workcell, carry.peak_normal_force)
+    witness = HandSimulation(carry.workcell, settings)
+    simulate = partial(witness.simulate, carriage_motion(carry, settings), planned)
+    return bisected(simulate, LOW_FACTOR, HIGH_FACTOR, FACTOR_BISECTIONS)
 
 
 class HeldInHands:
@@ -267,11 +301,16 @@ def lip_points(hand: Contact, points: int) -> Array:
     return np.asarray([(x * a, y * b) for a in across for b in along])
 
 
+def _normal_stiffness(hand: Contact, settings: SimulationSettings) -> float:
+    """Return the normal stiffness of a hand's layer per area [N/m^3]."""
+    return settings.layer * hand.layer_stiffness
+
+
 def _along(hand: Contact, settings: SimulationSettings) -> tuple[float, float]:
     """Return the stiffness of a hand's layer along the patch [N/m] and about its normal [N
     m/rad]."""
     points = lip_points(hand, settings.points)
-    shear = SHEAR * settings.layer * hand.area
+    shear = hand.layer_shear * _normal_stiffness(hand, settings) * hand.area
     return shear, shear * float((points**2).sum(axis=1).mean())
 
 
@@ -292,6 +331,7 @@ def _hand_text(hand: Contact, settings: SimulationSettings, k: int, borne: float
         borne: share of the payload's mass that the hand bears [kg].
     """
     shear, torsion = _along(hand, settings)
+    points = lip_points(hand, settings.points)
     mass, inertia = shear / HAND_FREQUENCY**2, torsion / HAND_FREQUENCY**2
     damping = 2.0 * SHEAR_DAMPING * np.sqrt(shear * (mass + borne))
     twisting = damping * torsion / shear
@@ -305,5 +345,5 @@ def _hand_text(hand: Contact, settings: SimulationSettings, k: int, borne: float
         <joint name="turn_{k}" type="hinge" axis="0 0 1" stiffness="{torsion!r}"
           damping="{float(twisting)!r}"/>
         <inertial pos="0 0 0" mass="{mass!r}" diaginertia="{inertia!r} {inertia!r} {inertia!r}"/>
-        {point_geoms(hand, settings.layer, lip_points(hand, settings.points), np.eye(4))}
+        {point_geoms(hand, _normal_stiffness(hand, settings), points, np.eye(4))}
       </body>"""

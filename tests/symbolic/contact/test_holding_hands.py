@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 from hybrid_opt.robust.force import BoxMotion, interpreted_robust_model
 from symbolic.array import Array
-from symbolic.contact.elastic import SHEAR, kern, layer_shares, layer_stiffness
+from symbolic.contact.elastic import kern, layer_shares, layer_stiffness
 from symbolic.contact.force_closure import wrench_to_box
 from symbolic.contact.holding_hands import HandPatch, internal_force_needs, required_holding_forces
 from symbolic.contact.load import load_function
@@ -52,6 +52,8 @@ def random_hands(seed: int, count: int) -> tuple[Contact, ...]:
         replace(
             kinds[k % 3],
             T_box_pad=transform(Rotation.random(rng=rng).as_matrix(), rng.uniform(-0.2, 0.2, 3)),
+            layer_shear=rng.uniform(0.1, 2.0),
+            layer_stiffness=rng.uniform(0.2, 5.0),
         )
         for k in range(count)
     )
@@ -113,7 +115,8 @@ def split_by_springs(hands: tuple[Contact, ...], load: Array) -> Array:
             x, y = place
             lever = np.array([[0.0, 0.0, y], [0.0, 0.0, -x], [-y, x, 0.0]])
             maps.append(np.vstack([np.eye(3), lever]))
-            compliance.append(1.0 / (share * hand.area * np.array([SHEAR, SHEAR, 1.0])))
+            along = hand.layer_stiffness * np.array([hand.layer_shear, hand.layer_shear, 1.0])
+            compliance.append(1.0 / (share * hand.area * along))
             owners.append(k)
     to_box = np.hstack([wrench_to_box(hands[k]) @ own for k, own in zip(owners, maps, strict=True)])
     # min 1/2 f C f  s.t.  B f = load; with g = sqrt(C) f the least norm.

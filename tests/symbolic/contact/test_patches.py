@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from symbolic.array import Array
-from symbolic.contact.elastic import SHEAR, free_shift, pressure_shifts
+from symbolic.contact.elastic import free_shift, pressure_shifts
 from symbolic.contact.paper import pressure_shift, required_moment
-from symbolic.records import Workcell
+from symbolic.records import Contact, Workcell
 from tests.symbolic.cells import call, hand_cell, solid_box
 
 
@@ -131,7 +131,7 @@ def test_two_discs_bear_a_moment_across_mostly_by_opposed_tangential_forces() ->
     stiffness, a quarter of its radius squared for a unit of its area."""
     cell, moment = level(hand_cell()), 3.0
     radius = cell.contacts[0].patch_radius
-    bending, opposed = radius**2 / 4.0, SHEAR * apart(cell) ** 2 / 4.0
+    bending, opposed = radius**2 / 4.0, Contact.layer_shear * apart(cell) ** 2 / 4.0
     per_pad = moment / 2.0 * bending / (bending + opposed)
     expected = per_pad / NORMAL[0, 0] / (radius / 4.0)
     found = pressure_shifts(cell, np.array([[0, 0, 0, moment, 0, 0]]), NORMAL)
@@ -149,7 +149,7 @@ def test_a_rectangle_lifts_off_at_a_third_of_its_half_side(sides: tuple[float, f
     cell = replace(cell, contacts=(first, second))
     axis = cell.contacts[0].T_box_pad[:3, 0]  # along x of the pads: bends them along y
     load = np.concatenate([np.zeros(3), 3.0 * axis])[None]
-    bending, opposed = sides[1] ** 2 / 3.0, SHEAR * apart(cell) ** 2 / 4.0
+    bending, opposed = sides[1] ** 2 / 3.0, Contact.layer_shear * apart(cell) ** 2 / 4.0
     expected = 1.5 * bending / (bending + opposed) / NORMAL[0, 0] / (sides[1] / 3.0)
     np.testing.assert_allclose(pressure_shifts(cell, load, NORMAL), expected, rtol=1e-9)
     assert free_shift(first) == pytest.approx(0.01 / 3.0)
