@@ -210,7 +210,7 @@ def phases(jobs: Sequence[DrawnJob], robots: Sequence[str]) -> Table:
             "trajectory and phase",
             "begins [s]",
             "takes [s]",
-            *(f"presses, {robot} [N]" for robot in robots),
+            *(f"force, {robot} [N]" for robot in robots),
             *(f"{name} [%]" for name in PHASE_LIMITS),
         ),
         tuple(rows),

@@ -229,7 +229,7 @@ def _checked(price: RobustPrice) -> str:
     slips = "slips" if price.check.failing == 1 else "slip"
     return (
         f"{price.check.failing or 'none'} of {price.check.cases} random cases {slips} "
-        f"({price.uncertainty}); the leading arm presses up to {newtons(max(price.commanded))}; "
+        f"({price.uncertainty}); the leading arm needs up to {newtons(max(price.commanded))}; "
         f"the reference forces would hold {price.largest_factor:.2f} times as much"
     )
 

@@ -171,7 +171,7 @@
       return line;
     };
     $("phase-table").tHead.replaceChildren(row(["phase", "begins [s]", "takes [s]",
-      ...data.robots.map((robot) => `${robot} presses [N]`), "most used limit"], "th"));
+      ...data.robots.map((robot) => `${robot}, force [N]`), "most used limit"], "th"));
     $("phase-table").tBodies[0].replaceChildren(...phases.map((phase) => row([phase.name,
       phase.begin.toFixed(2), phase.duration.toFixed(2), ...phase.peaks.map((f) => f.toFixed(1)),
       `${phase.most} ${phase.use.toFixed(0)} %`], "td")));
