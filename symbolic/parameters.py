@@ -17,7 +17,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cache, cached_property, lru_cache, partial
-from itertools import repeat
 from math import prod
 from pathlib import Path
 from types import MappingProxyType
@@ -28,9 +27,7 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel
-from symbolic.contact.elastic import layer_shares
 from symbolic.contact.force_closure import dependent_components, grasp_shapes
-from symbolic.contact.holding_hands import internal_force_needs, weaker_shares
 from symbolic.contact.registry import command_model, contact_model
 from symbolic.contact.soft_finger import SoftPatch
 from symbolic.geometry.screen import Screen, ScreenBase, ScreenBody
@@ -291,18 +288,9 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
     names += ["angular_velocity_max", "angular_acceleration_max"]
     own = {name: take(HELD, f"payload.{name}", getattr(payload, name)) for name in names}
     payload = _as(NumberedPayload, payload, **own, given=take.group(HELD))
-    holds = any(contact.holding_force for contact in cell.contacts)
-    hands: Iterator[dict[str, Any]] = repeat({})
-    if holds:
-        needs = internal_force_needs(cell.pads, cell.pad_robots)
-        hands = (
-            {"share": share, "opposed": opposed, "weaker": weaker}
-            for share, opposed, weaker in zip(
-                layer_shares(cell.pads), needs, weaker_shares(cell.pads), strict=True
-            )
-        )
+    derived = iter(contact_model(cell).pad_parameters)
     contacts: Any = tuple(
-        _contact(take, f"contacts[{i}]", contact, cell, hands)
+        _contact(take, f"contacts[{i}]", contact, cell, derived)
         for i, contact in enumerate(cell.contacts)
     )
     return NumberedWorkcell(
@@ -407,9 +395,9 @@ def _contact(
     path: str,
     contact: Contact,
     cell: Workcell,
-    hands: Iterator[dict[str, Any]],
+    derived: Iterator[dict[str, Any]],
 ) -> Any:
-    hand = next(hands)
+    own = next(derived)
     pose = (take(HELD, f"{path} pose", part) for part in _split(contact.T_box_pad))
     patch = SoftPatch.of(contact, cell.contacts[0].T_box_pad[:3, :3])
     sides = contact.half_sides
@@ -423,7 +411,7 @@ def _contact(
         if sides is None
         else tuple(take(HELD, f"{path}.patch_size[{k}]", side) for k, side in enumerate(sides)),
         further=tuple(
-            _contact(take, f"{path}.further[{k}]", pad, cell, hands)
+            _contact(take, f"{path}.further[{k}]", pad, cell, derived)
             for k, pad in enumerate(contact.further)
         ),
         twist=take(HELD, f"{path} twist", patch.twist),
@@ -431,7 +419,7 @@ def _contact(
         holding_force=0.0,
         layer_shear=0.0,
         layer_stiffness=0.0,
-        **{name: take(HELD, f"{path} {name}", value) for name, value in hand.items()},
+        **{name: take(HELD, f"{path} {name}", value) for name, value in own.items()},
     )
 
 

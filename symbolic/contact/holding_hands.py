@@ -52,6 +52,9 @@ LEAST_MEAN_NORMAL = 0.1
 """If the mean of the normals of an arm's hands is shorter than this, the hands are fingers around
 an edge."""
 
+HAND_PARAMETERS = ("share", "opposed", "weaker")
+"""Fields of `NumberedContact` that hands have in addition."""
+
 FLOOR = 1e-9
 """Added in squares to forces [N] and moments [N m], so that lengths have derivatives at zero."""
 
@@ -140,12 +143,6 @@ def internal_force_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Arra
     return np.array(found)
 
 
-def weaker_shares(pads: Sequence[Contact]) -> list[float]:
-    """Return the least holding force of all hands over that of each."""
-    own = np.array([pad.holding_force for pad in pads])
-    return [float(share) for share in own.min() / np.maximum(own, FLOOR)]
-
-
 class HoldingHands(ContactModel):
     """Contact model of hands of both arms, any number and with any normals.
 
@@ -162,6 +159,21 @@ class HoldingHands(ContactModel):
     order = "hold with"
     closing = ("grip_on", "load")
     opening = ("unload", "grip_off")
+
+    @property
+    def pad_parameters(self) -> list[dict[str, Any]]:
+        """For each hand its matrix of `layer_shares`, its row of `internal_force_needs`, and the
+        least holding force of all hands over its own."""
+        pads = self.workcell.pads
+        if isinstance(pads[0], NumberedContact):
+            return [{name: getattr(pad, name) for name in HAND_PARAMETERS} for pad in pads]
+        own = np.array([pad.holding_force for pad in pads])
+        values = (
+            layer_shares(pads),
+            internal_force_needs(pads, self.workcell.pad_robots),
+            own.min() / np.maximum(own, FLOOR),
+        )
+        return [dict(zip(HAND_PARAMETERS, each, strict=True)) for each in zip(*values, strict=True)]
 
     @property
     def problem(self) -> Problem | None:
@@ -210,10 +222,11 @@ class HoldingHands(ContactModel):
         whole = ca.vertcat(in_box, about)
         needed, rubbed = [ca.SX(0.0), ca.SX(0.0)], [ca.SX(0.0), ca.SX(0.0)]
         forces, moments = ([ca.SX.zeros(3), ca.SX.zeros(3)] for _ in range(2))
-        for hand, i, share, weaker in zip(
-            workcell.pads, workcell.pad_robots, self._shares, self._weaker, strict=True
+        for hand, i, own_numbers in zip(
+            workcell.pads, workcell.pad_robots, self.pad_parameters, strict=True
         ):
-            own, friction = ca.mtimes(share, whole), load.friction[i]
+            weaker = own_numbers["weaker"]
+            own, friction = ca.mtimes(number(own_numbers["share"]), whole), load.friction[i]
             lifting, sliding = required_holding_forces(own, friction, HandPatch.of(hand))
             needed[i] = ca.fmax(needed[i], weaker * ca.fmax(lifting, sliding))
             rubbed[i] = ca.fmax(rubbed[i], weaker * (_length(own[0], own[1]) - friction * own[2]))
@@ -293,33 +306,7 @@ class HoldingHands(ContactModel):
         """Return the largest additional holding force that one newton between the arms requires of
         a hand."""
         most = ca.SX(0.0)
-        for (a, b, lifting), i, weaker in zip(
-            self._opposed, self.workcell.pad_robots, self._weaker, strict=True
-        ):
-            most = ca.fmax(most, weaker * ca.fmax(a / friction[i] + b, lifting))
+        for i, own in zip(self.workcell.pad_robots, self.pad_parameters, strict=True):
+            a, b, lifting = ca.vertsplit(ca.vec(number(own["opposed"])))
+            most = ca.fmax(most, own["weaker"] * ca.fmax(a / friction[i] + b, lifting))
         return most
-
-    @property
-    def _weaker(self) -> list[Any]:
-        """Per hand the weaker holding force over its own; symbols if the cell's numbers are."""
-        pads = self.workcell.pads
-        if isinstance(pads[0], NumberedContact):
-            return [pad.weaker for pad in pads if isinstance(pad, NumberedContact)]
-        return weaker_shares(pads)
-
-    @property
-    def _opposed(self) -> list[list[Any]]:
-        """For each hand its row of `internal_force_needs`; symbols if the cell's numbers are
-        symbols."""
-        pads = self.workcell.pads
-        if isinstance(pads[0], NumberedContact):
-            return [ca.vertsplit(p.opposed) for p in pads if isinstance(p, NumberedContact)]
-        return [list(row) for row in internal_force_needs(pads, self.workcell.pad_robots)]
-
-    @property
-    def _shares(self) -> list[Any]:
-        """For each hand its matrix of `layer_shares`; symbols if the cell's numbers are symbols."""
-        pads = self.workcell.pads
-        if isinstance(pads[0], NumberedContact):
-            return [pad.share for pad in pads if isinstance(pad, NumberedContact)]
-        return list(map(ca.DM, layer_shares(pads)))

@@ -13,7 +13,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import casadi as ca
 import numpy as np
@@ -157,6 +157,11 @@ class ContactModel(ABC):
     def command_model(self) -> ContactModel:
         """The contact model of commanded forces and worst cases."""
         return self
+
+    @property
+    def pad_parameters(self) -> list[dict[str, Any]]:
+        """Derived quantities of each pad that formulas read, by field of `NumberedContact`."""
+        return [{} for _ in self.workcell.pads]
 
     @property
     @abstractmethod
