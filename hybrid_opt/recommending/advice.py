@@ -27,6 +27,9 @@ from symbolic.records.task import POSE_SIZE, components
 
 MARGIN_BISECTIONS = 20
 
+LARGER_CUP = 5e-3
+"""Growth of the radius of cups whose effect is stated [m]."""
+
 MILLIMETRE = 1e-3
 
 FRICTION_CHANGE = 0.05
@@ -158,7 +161,8 @@ def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tu
 
 def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str, float]]:
     """Yield changes of the cell by name, each with the rise of the largest commanded force along a
-    motion [N]."""
+    motion [N]. Where a change makes hands stronger, it is the rise of the same share of today's
+    holding force."""
     doubt = workcell.uncertainty
 
     def needed(cell: Workcell, motion: BoxMotion) -> Array:
@@ -174,10 +178,13 @@ def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str
     is_held_at_sides = all(
         abs(each.T_box_pad[:3, 2] @ up) < LARGEST_SIDE_COSINE for each in workcell.contacts
     )
+    if all(contact.kind == "cup" for contact in workcell.contacts):
+        changes[f"cups {2e3 * LARGER_CUP:.0f} mm larger across at the same vacuum"] = _larger
     if is_held_at_sides:
         changes["pads 1 mm lower"] = partial(_moved, by=-MILLIMETRE * up)
     for name, change in changes.items():
-        yield name, float(needed(_with_pads(workcell, change), at).max() - now.max())
+        other = _with_pads(workcell, change)
+        yield name, float(needed(other, at).max() / _strength(workcell, other) - now.max())
     if is_held_at_sides and abs(height) > LEAST_HEIGHT:
         level = _with_pads(workcell, partial(_moved, by=-height * up))
         side = "above" if height > 0.0 else "below"
@@ -224,6 +231,19 @@ def _wider(pad: Contact) -> Contact:
         return replace(pad, patch_radius=pad.patch_radius + MILLIMETRE)
     x, y = (side + MILLIMETRE for side in pad.half_sides)
     return replace(pad, patch_radius=float(np.hypot(x, y)), half_sides=(x, y))
+
+
+def _larger(cup: Contact) -> Contact:
+    """Return a larger cup, whose vacuum pulls on a larger area."""
+    radius = cup.patch_radius + LARGER_CUP
+    force = cup.holding_force * (radius / cup.patch_radius) ** 2
+    return replace(cup, patch_radius=radius, holding_force=force)
+
+
+def _strength(workcell: Workcell, other: Workcell) -> float:
+    """Return the weaker holding force of another cell over that of a cell; 1 for pads."""
+    own, new = (min(c.holding_force for c in cell.contacts) for cell in (workcell, other))
+    return new / own if own else 1.0
 
 
 def _of_pitch(cell: Cell, path: Array, option: Option, slope: float) -> Iterator[Advice]:
