@@ -149,10 +149,18 @@ def _changes(workcell: Workcell, ways: Array, at: tuple[float, float]) -> dict[s
     `Cell.changed`."""
     if at == (0.0, 0.0):
         return {}
+    pads = {
+        f"contacts[{k}]{further}": pad
+        for k, contact in enumerate(workcell.contacts)
+        for further, pad in [
+            ("", contact),
+            *((f".further[{j}]", other) for j, other in enumerate(contact.further)),
+        ]
+    }
     shift = np.asarray(at) @ ways
     return {
-        f"contacts[{k}].xyz": np.round(contact.T_box_pad[:3, 3] + shift, 6).tolist()
-        for k, contact in enumerate(workcell.contacts)
+        f"{key}.xyz": np.round(pad.T_box_pad[:3, 3] + shift, 6).tolist()
+        for key, pad in pads.items()
     }
 
 

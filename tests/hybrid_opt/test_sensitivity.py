@@ -12,6 +12,7 @@ import pytest
 
 import hybrid_opt as ho
 from hybrid_opt.extras import sweeping
+from hybrid_opt.extras.gripping import _changes
 from hybrid_opt.front import Front
 from hybrid_opt.robust.cases import LEADER, worst_cases
 from hybrid_opt.robust.force import robust_model
@@ -317,6 +318,14 @@ def test_the_cell_is_certified_and_differs_in_its_pads_alone(grip: ho.Grip) -> N
         moved = own.T_box_pad[:3, 3] - other.T_box_pad[:3, 3]
         np.testing.assert_allclose(moved, [0.0, 0.0, grip.up], atol=1e-9)
     np.testing.assert_array_equal(cell.initial, given.initial)
+
+
+def test_all_pads_of_an_arm_move_together() -> None:
+    cell, ways = shipped("fork"), np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0]])
+    moved = cell.changed(_changes(cell.workcell, ways, (0.01, 0.005)))
+    for own, other in zip(cell.workcell.pads, moved.workcell.pads, strict=True):
+        shift = other.T_box_pad[:3, 3] - own.T_box_pad[:3, 3]
+        np.testing.assert_allclose(shift, [0.005, 0.0, 0.01], atol=1e-9)
 
 
 def test_what_cannot_be_compared_is_told() -> None:
