@@ -229,7 +229,9 @@ def simulate_hands(
     cases = random_cases(workcell, workcell.uncertainty, options.runs, rng)
     held = np.zeros(2, dtype=int)
     for case in cases:
-        drawn = HandSimulation(workcell_of_case(workcell, case), settings, case[8:11])
+        direction = rng.normal(size=3)
+        opposed = case[17] * direction / np.linalg.norm(direction)
+        drawn = HandSimulation(workcell_of_case(workcell, case), settings, case[8:11], opposed)
         left = 1.0 - case[15:17].max()
         held += [drawn.simulate(motion, holding, share * left).holds for share in (1.0, 0.5)]
     print(
@@ -288,9 +290,10 @@ def worst_friction(workcell: Workcell) -> Workcell:
 def simulate_file(options: argparse.Namespace) -> int:
     """Simulate a trajectory file and print the results. Return the exit code."""
     pads: Pads = "driven" if options.controller == PADS_DRIVEN else "even"
-    settings = SimulationSettings(options.time_step, pads=pads)
-    period = max(options.time_step, ArmSettings.control_period)
-    arms = ArmSettings(options.time_step, control_period=period, stiffness=options.stiffness)
+    step = options.time_step or SimulationSettings.time_step
+    settings = SimulationSettings(step, pads=pads)
+    period = max(step, ArmSettings.control_period)
+    arms = ArmSettings(step, control_period=period, stiffness=options.stiffness)
     stored = read_trajectory(options.file)
     with TemporaryDirectory() as folder:
         cell = stored.open_cell(Path(folder))
@@ -308,7 +311,7 @@ def simulate_file(options: argparse.Namespace) -> int:
         )
         progress.note("simulating: the least force that holds, then random cases")
         if options.controller == HANDS:
-            hands = replace(HAND_SETTINGS, time_step=options.time_step)
+            hands = replace(HAND_SETTINGS, time_step=options.time_step or HAND_SETTINGS.time_step)
             simulate_hands(cell, carry, hands, options)
             return 0
         if options.controller in PAD_WITNESSES:

@@ -145,7 +145,7 @@ def plan_of(
     program: str,
     leads: Sequence[float],
     stiffness: float | None,
-    sensors: Sequence[bool],
+    presses: bool,
 ) -> dict[str, Any]:
     """Return the values of the drivers that a bundle was planned for. The bundle's bring-up program
     compares them with the values that it measures.
@@ -156,14 +156,14 @@ def plan_of(
         program: name of the program that runs the job.
         leads: compensated part of each arm's lag [s].
         stiffness: of each arm at its pad [N/m]; None if the job does not depend on it.
-        sensors: whether a sensor measures how strongly each arm presses.
+        presses: whether a sensor measures how strongly a block is pressed.
     """
     drivers = [vars(robot.driver).items() for robot in workcell.robots]
     return {
         "target": target,
         "program": program,
         "leads": list(leads),
-        "sensors": list(sensors),
+        "presses": presses,
         "stiffness": stiffness,
         "drivers": [{k: v for k, v in driver if v is not None} for driver in drivers],
     }

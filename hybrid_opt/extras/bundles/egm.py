@@ -162,18 +162,17 @@ def egm_files(export: Export) -> dict[str, str | bytes]:
     # Along the pad's normal, without turning it.
     way = np.concatenate([robots[follower].T_flange_pad[:3, 2], np.zeros(3)])
     lags = [robot.driver.lag for robot in robots]
-    sensors = [robot.driver.force_control for robot in robots]
     lag = max(LEAST_LAG, lags[follower])
     assert export.stiffness is not None, "the target requires it"
     compliance = 2.0 / export.stiffness
     time, force = export.sampled.time, export.sampled.normal_force[:, follower]
     force_rate = float((np.abs(np.diff(force)) / np.diff(time)).max())
     config = {
-        "plan": plan_of(export.workcell, "abb-egm", "run_egm.py", lags, export.stiffness, sensors),
+        "plan": plan_of(export.workcell, "abb-egm", "run_egm.py", lags, export.stiffness, True),
         "ports": list(PORTS),
         "addresses": [robot.driver.address for robot in robots],
         "lags": lags,
-        "sensors": sensors,
+        "sensors": [robot.driver.force_control for robot in robots],
         "press": {
             "arm": follower,
             "gain": CROSSOVER * compliance / lag,

@@ -188,9 +188,10 @@ def torque_files(export: Export) -> dict[str, str | bytes]:
     if export.job.follower is None:
         config["wrench"] = [None, None]
         config["grip"] = [_grip(export, arm) for arm in (0, 1)]
-    sensors = [source is not None for source in config["wrench"]]
     usual = {
-        "plan": plan_of(export.workcell, "torque", "run_job.py", (0.0, 0.0), None, sensors),
+        "plan": plan_of(
+            export.workcell, "torque", "run_job.py", (0.0, 0.0), None, any(config["wrench"])
+        ),
         "simulated": driver == "simulation",
         "lag": export.lag,
         "step": export.step,

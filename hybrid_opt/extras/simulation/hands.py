@@ -13,6 +13,7 @@ these springs and Coulomb's law at each point. A planned carry contributes only 
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from copy import copy
 from dataclasses import dataclass
 from functools import cache, partial
@@ -59,8 +60,9 @@ so a sliding contact between them is slowed by this damping."""
 SHEAR_DAMPING = 0.7
 """Damping ratio of the layers along their patches, with the payload's mass."""
 
-HAND_SETTINGS = SimulationSettings(settle=0.4)
-"""Usual settings. Hands take the payload's weight so slowly that it hardly swings."""
+HAND_SETTINGS = SimulationSettings(time_step=5e-4, settle=0.4)
+"""Usual settings. Hands take the payload's weight so slowly that it hardly swings. With steps of
+1 ms and longer, swings between facing hands may grow by themselves."""
 
 TAKEN = 0.75
 """Share of the settling time in which hands take the payload's weight."""
@@ -112,6 +114,7 @@ class HandSimulation:
         workcell: Workcell,
         settings: SimulationSettings | None = None,
         disturbance: ArrayLike = (0.0, 0.0, 0.0),
+        opposed: ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
         """Build the model of the scene. Nothing is simulated yet.
 
@@ -120,6 +123,8 @@ class HandSimulation:
             settings: settings of the simulation; None for `HAND_SETTINGS`.
             disturbance: (3,) acceleration that the hands have to give the payload in addition to
                 the motion's, world frame [m/s^2].
+            opposed: (3,) force of the second arm's hands on the payload against those of the
+                first, box frame [N]. The second arm is displaced until it acts.
 
         Raises:
             SimulationError: MuJoCo is not installed.
@@ -133,6 +138,7 @@ class HandSimulation:
         self.settings = settings or HAND_SETTINGS
         self._mujoco = mujoco_module()
         self._disturbance = disturbance
+        self._displaced = _displacement(workcell, self.settings.layer, opposed)
         self._model = cache(self._compiled)
 
     def simulate(
@@ -148,13 +154,16 @@ class HandSimulation:
         mujoco, settings = self._mujoco, self.settings
         model = copy(self._model())
         hands = self._hands
-        force = factor * np.broadcast_to(holding_force, 2)[list(self.workcell.pad_robots)]
+        robots = self.workcell.pad_robots
+        force = factor * np.broadcast_to(holding_force, 2)[list(robots)]
         stiffness = np.array([_normal_stiffness(hand, settings) * hand.area for hand in hands])
         for k, hand in enumerate(hands):
             depth = max(0.0, force[k]) / stiffness[k]
             model.body(f"hand_{k}").pos[:] = hand.T_box_pad[:3, 3] + depth * hand.T_box_pad[:3, 2]
         data = mujoco.MjData(model)
         held = HeldInHands(model, data, self.workcell)
+        second = [int(model.body(f"hand_{k}").id) for k, i in enumerate(robots) if i == 1]
+        at = model.body_pos[second].copy()
         box = int(model.joint("box").qposadr[0])
         joints = [
             [int(model.joint(f"{name}_{k}").dofadr[0]) for name in HAND_JOINTS] for k in held.each
@@ -164,21 +173,25 @@ class HandSimulation:
         data.ctrl[:] = force
         gravity, taken = model.opt.gravity.copy(), TAKEN * settings.settle
         every = max(1, round(SLIP_INTERVAL / settings.time_step))
-        seen = []
+        motion.apply(data, 0)
+        mujoco.mj_kinematics(model, data)
+        seen = [(float(motion.time[0]), *held.look())]
         for k, time in enumerate(motion.time):
             motion.apply(data, k)
             # What stands beneath the payload gives its weight to the hands little by little.
             given = min(1.0, (time - motion.time[0]) / taken)
-            model.opt.gravity[:] = gravity * given**2 * (3.0 - 2.0 * given)
+            given *= given * (3.0 - 2.0 * given)
+            model.opt.gravity[:] = gravity * given
+            model.body_pos[second] = at + given * self._displaced
             data.qfrc_applied[joints] = own[k]
             mujoco.mj_step(model, data)
             if k % every or time < motion.time[0] + taken:
                 continue
             slip, lift, turned = held.look()
-            seen.append((float(time), slip, turned, lift))
+            seen.append((float(time), slip, lift, turned))
             if not (slip.max() <= settings.slip and lift.max() <= 0.0):
                 break
-        times, slips, turns, lifts = (np.array(values) for values in zip(*seen, strict=True))
+        times, slips, lifts, turns = (np.array(values) for values in zip(*seen, strict=True))
         holds = bool(slips[-1].max() <= settings.slip and lifts[-1].max() <= 0.0)
         return HandOutcome(factor, holds, times, slips, turns, lifts)
 
@@ -264,18 +277,30 @@ class HeldInHands:
 def swing_frequency(workcell: Workcell, settings: SimulationSettings = HAND_SETTINGS) -> float:
     """Compute the lowest frequency with which the payload swings on the layers of its hands while
     the arms are at rest [Hz]."""
-    payload = workcell.payload
-    maps = [wrench_to_box(hand) for hand in workcell.pads]
-    stiffness = sum(
-        A @ (settings.layer * layer_stiffness(hand)) @ A.T
-        for A, hand in zip(maps, workcell.pads, strict=True)
-    )
+    payload, stiffness = workcell.payload, _stiffness(workcell.pads, settings.layer)
     # Velocities of the centre of mass from those of the box frame.
     to_centre = np.eye(6)
     to_centre[:3, 3:] = np.cross(np.eye(3), payload.centre_of_mass)
     inertia = block_diag(payload.mass * np.eye(3), payload.inertia)
     squares = eigh(stiffness, to_centre.T @ inertia @ to_centre, eigvals_only=True)
     return float(np.sqrt(squares[0]) / (2.0 * np.pi))
+
+
+def _stiffness(hands: Iterable[Contact], layer: float) -> Array:
+    """Compute the stiffness (6, 6) of hands on their layers about the box frame [N, m, rad]."""
+    maps = [(wrench_to_box(hand), layer * layer_stiffness(hand)) for hand in hands]
+    return np.asarray(sum(A @ K @ A.T for A, K in maps))
+
+
+def _displacement(workcell: Workcell, layer: float, opposed: ArrayLike) -> Array:
+    """Compute the displacement (3,) of the second arm, which does not turn, by which its hands act
+    against those of the first with a force, box frame [N, m]."""
+    hands = list(zip(workcell.pads, workcell.pad_robots, strict=True))
+    softness = sum(
+        np.linalg.inv(_stiffness([hand for hand, robot in hands if robot == i], layer))
+        for i in (0, 1)
+    )
+    return np.linalg.solve(np.linalg.inv(softness)[:3, :3], np.asarray(opposed, dtype=float))
 
 
 def lip_points(hand: Contact, points: int) -> Array:

@@ -272,7 +272,7 @@ def bring_up(
         Refused: a measurement fails.
     """
     parts = [(unloaded(job), "")]
-    parts += [(pressing(job), "press")] if any(plan["sensors"]) else []
+    parts += [(pressing(job), "press")] if plan["presses"] else []
     for part, word in parts:
         if not drive(part, word):
             fast = [f"{looks.speed(job, arm):.2f}" for arm in (0, 1)]
@@ -323,8 +323,7 @@ def _problems(job: Job, plan: dict[str, Any], found: Sequence[Measured]) -> Iter
             f"the arms are {1e3 * apart:.1f} ms apart, the job bears {1e3 * job.limits.skew:.1f} "
             f"(--skew {apart:.3f}, a slower timing)"
         )
-    arms = zip(job.robots, found, plan["drivers"], plan["sensors"], strict=True)
-    for robot, own, driver, is_felt in arms:
+    for robot, own, driver in zip(job.robots, found, plan["drivers"], strict=True):
         name, planned, most = robot["name"], plan["stiffness"], max(robot["normal_force"])
         if not abs(own.lag - driver["lag"]) <= LAG:
             yield f"{name} lags by {1e3 * own.lag:.0f} ms, planned are {1e3 * driver['lag']:.0f}"
@@ -333,10 +332,6 @@ def _problems(job: Job, plan: dict[str, Any], found: Sequence[Measured]) -> Iter
                 f"{name} reaches {100.0 * own.speed:.0f} % of the planned speed: let its "
                 "controller drive it, or time the carry with a lower velocity_max of the robot"
             )
-        if not is_felt:
-            continue
-        if isnan(own.sign):
-            yield f"no force of {name} was measured: is its sensor published?"
         if abs(own.offset) > UNLOADED * most:
             yield f"the sensor of {name} feels {own.offset:.1f} N in the air: zero it"
         if planned and abs(own.stiffness - planned) > STIFFNESS * planned:

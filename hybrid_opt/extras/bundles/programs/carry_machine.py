@@ -28,6 +28,9 @@ SLOW = 0.25
 """Share of the fastest speed below which a posture says too little of the coordinate to call an arm
 late."""
 
+SLOWEST = 0.1
+"""Least share of the quick stop's time in which slow arms stop."""
+
 UNLOADED = 0.07
 """Largest force before the first contact, over the largest commanded one: an offset of the sensor
 becomes an error of the squeeze."""
@@ -311,7 +314,9 @@ class Machine:
         stop there, unless the release begins sooner."""
         if not self.job.is_touching(self.clock.s):
             return False
-        takes = self.job.limits.quick_stop
+        # Slow arms can stop sooner, and press less until then.
+        share = self.job.speed(0, self.clock.s) / self.job.fastest
+        takes = max(share, SLOWEST) * self.job.limits.quick_stop
         if self.clock.s + self.lead + takes / 2.0 < self.job.begin("release"):
             self.state, self.reason, self.stop_time = "landing", force, takes
             self.clock.turn(0.0, self.lead, takes)

@@ -115,7 +115,6 @@ class Stream:
         self.job, self.config = job, config
         self.looks = known if isinstance(known, Looks) else None
         self._signs = None if isinstance(known, Looks) else [each.sign for each in known]
-        self._offset = self.looks.offset(config["press"]["arm"]) if self.looks else math.nan
         sensors = config["sensors"] if self._signs else (False, False)
         self.machine = Machine(job, 0.0, sensors=sensors)
         self.press = Press(config["press"])
@@ -197,7 +196,7 @@ class Stream:
         elif self.machine.state == "running":
             raw = self._force[self._arm]
             if raw is not None:
-                self.press.creep(dt, wanted, abs(raw - self._offset))
+                self.press.creep(dt, wanted, abs(raw - self.looks.offset(self._arm)))
             self.looks.note(now, self.machine, seen, list(self._force), self.press.way)
         if self.machine.state == "held" and self.command in ("continue", "back"):
             direction = 1.0 if self.command == "continue" else -1.0
