@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from hybrid_opt.carry import ArmMotion, Carry
+from hybrid_opt.errors import SimulationError
 from hybrid_opt.extras.simulation.box import bisected, carriage_motion
 from hybrid_opt.extras.simulation.hands import (
     HAND_SETTINGS,
@@ -37,9 +38,18 @@ SWINGS = 15.0
 """Least number of natural oscillations of the payload on its layers during a carry. The contact
 model does not include oscillations."""
 
-LOW, HIGH, BISECTIONS = 0.5, 1.5, 7
-"""Bounds of the factor on the holding force, and number of bisections between them, which reach an
-accuracy of 0.4 %."""
+LOW, HIGH = 0.3, 1.5
+"""Bounds of the factor on the holding force if the threshold is not near the expected one."""
+
+EXPECTED = (0.97, 1.03)
+"""Multiples of the rims' share and of the required force between which the threshold is
+expected."""
+
+RESOLUTION = 0.008
+"""Difference of the factors on both sides of a threshold."""
+
+ROUGH = 1e6
+"""Coefficient of friction with which nothing slides."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +61,7 @@ class HandThreshold:
         hands: number of hands.
         swings: number of natural oscillations of the payload on its layers during the carry.
         needed: holding force that the contact model requires [N].
+        rims: share of it that the model requires if nothing can slide.
         ratio: least holding force that suffices in the simulator, over the required one.
         lifts: True if a rim lifts below that force, False if a hand slips.
     """
@@ -59,13 +70,14 @@ class HandThreshold:
     hands: int
     swings: float
     needed: float
+    rims: float
     ratio: float
     lifts: bool
 
     def __str__(self) -> str:
         return (
             f"{self.kind:12} {self.hands:5} {self.swings:7.1f} {self.needed:9.2f} N "
-            f"{self.ratio:7.3f}  {'lifts' if self.lifts else 'slips'}"
+            f"{self.rims:6.3f} {self.ratio:7.3f}  {'lifts' if self.lifts else 'slips'}"
         )
 
 
@@ -87,22 +99,48 @@ def needed_force(carry: Carry) -> float:
     return float(model.nominal(box_motion(carry)).max())
 
 
+def rims_share(carry: Carry) -> float:
+    """Compute the share of the needed force with which no rim lifts, if nothing can slide."""
+    first, second = (_rough(contact) for contact in carry.workcell.contacts)
+    rough = replace(carry, workcell=replace(carry.workcell, contacts=(first, second)))
+    return needed_force(rough) / needed_force(carry)
+
+
+def _rough(contact: Contact) -> Contact:
+    further = tuple(replace(hand, friction=ROUGH) for hand in contact.further)
+    return replace(contact, friction=ROUGH, further=further)
+
+
 def threshold(kind: str, carry: Carry) -> HandThreshold:
-    """Find the least holding force with which a carry succeeds in the simulator."""
+    """Find the least holding force with which a carry succeeds in the simulator.
+
+    The search starts where the contact model expects the threshold. It is repeated in a wide range
+    if the threshold is not there.
+    """
     workcell = carry.workcell
-    needed = needed_force(carry)
+    needed, rims = needed_force(carry), rims_share(carry)
     simulate = partial(
         HandSimulation(workcell).simulate, carriage_motion(carry, HAND_SETTINGS), needed
     )
-    found = bisected(simulate, LOW, HIGH, BISECTIONS)
+    low, high = EXPECTED[0] * max(rims, LOW), EXPECTED[1]
+    try:
+        found = bisected(simulate, low, high, _steps(low, high))
+    except SimulationError:
+        found = bisected(simulate, LOW, HIGH, _steps(LOW, HIGH))
     return HandThreshold(
         kind,
         len(workcell.pads),
         swing_frequency(workcell) * carry.duration,
         needed,
+        rims,
         found.factor,
         found.slips.lifts,
     )
+
+
+def _steps(low: float, high: float) -> int:
+    """Return the bisections that narrow a range down to the resolution."""
+    return int(np.ceil(np.log2((high - low) / RESOLUTION)))
 
 
 def carry_along(workcell: Workcell, path: Array, duration: float) -> Carry:
@@ -221,7 +259,7 @@ def summary(found: Sequence[HandThreshold]) -> str:
 
 def thresholds(options: argparse.Namespace) -> int:
     """Print the threshold of each carry. Return the exit code."""
-    print("hands        count  swings     needed     ratio  below it")
+    print("hands        count  swings      needed   rims   ratio  below it")
     found = []
     for k, kind in enumerate(islice(cycle(KINDS), options.carries)):
         carry = draw(kind, np.random.default_rng([options.seed, k]), options.swings)

@@ -109,10 +109,12 @@ def test_the_recommended_carry_is_held_over_the_whole_uncertainty(
 def test_hands_hold_the_recommended_carry_over_the_whole_uncertainty(
     recommended: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    """A part of the recommended force is for arms that work against one another, and half of it
+    may do without: half of the planned force does not."""
     assert simulate.main([str(recommended), "--runs", "20"]) == 0
     out = capsys.readouterr().out
-    assert float(out.split("holds from ")[1].split()[0]) <= 1.02
-    assert "20 of 20 random cases hold (seed 1), 0 with half of it" in out
+    assert 0.8 <= float(out.split("holds from ")[1].split()[0]) <= 1.02
+    assert "20 of 20 random cases hold (seed 1)" in out
 
 
 @pytest.mark.parametrize("name", ["palletising", "rack"])

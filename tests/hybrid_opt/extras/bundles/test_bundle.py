@@ -17,7 +17,6 @@ import pytest
 from hybrid_opt.errors import JobError, ResultsError
 from hybrid_opt.extras.bundles import BundleOptions, Origin, export
 from hybrid_opt.extras.bundles.job_file import pad_places
-from hybrid_opt.extras.bundles.programs.bring_up import FILE
 from hybrid_opt.extras.bundles.targets import missing_for
 from hybrid_opt.job.records import Job, sample_job
 from hybrid_opt.store.bundle_file import read_manifest, write_bundle
@@ -51,8 +50,6 @@ def test_a_bundle_is_replaced_as_a_whole(tmp_path: Path) -> None:
         "sub/b.bin",
     ]
     assert read_manifest(folder)["files"]["a.txt"] == sha256(b"one")
-    # Its own bring-up may have left its numbers there.
-    (folder / FILE).write_text("job = ''")
     write_bundle(folder, {"c.txt": "three"}, {"target": "x"})
     assert set(tree(folder)) == {"manifest.json", "c.txt"}
     assert [path.name for path in folder.parent.iterdir()] == ["bundle"]

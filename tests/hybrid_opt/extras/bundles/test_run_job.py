@@ -377,7 +377,6 @@ LATE: dict[str, tuple[str, Fault]] = {
     "right lags by 6. ms, planned are 30": ("ur", lambda w: setattr(w, "lag", [0.06, 0.065])),
     "the arms are .* ms apart": ("simulation", lambda w: setattr(w, "lag", [0.0, 0.06])),
     "the sensor of left feels": ("ur", off_by_ten),
-    "no force of left was measured": ("franka", deaf_from_the_start),
 }
 
 

@@ -17,10 +17,19 @@ from hybrid_opt.extras.simulation.hands import (
     lip_points,
     swing_frequency,
 )
-from studies.research.hand_carries import KINDS, carry_along, draw, needed_force, threshold
+from hybrid_opt.robust.force import box_motion, interpreted_robust_model
+from studies.research.hand_carries import (
+    KINDS,
+    RESOLUTION,
+    SWINGS,
+    carry_along,
+    draw,
+    needed_force,
+    threshold,
+)
 from symbolic.contact.elastic import kern
 from symbolic.errors import SettingsError
-from symbolic.records import Contact, Workcell
+from symbolic.records import Contact, Uncertainty, Workcell
 from symbolic.records.poses import transform
 from tests.hybrid_opt.cells import shipped
 from tests.refusals import refused
@@ -71,6 +80,22 @@ def test_cups_without_moments_need_what_makers_say(
     assert found.factor == pytest.approx(1.0, abs=0.02)
 
 
+def test_arms_that_pull_against_one_another_lift_a_rim() -> None:
+    """One cup of each arm, level, across their faces. Neither arm turns, so each cup also bears
+    half of the couple of both. Along their faces a slip relieves both."""
+    workcell, pull = two_cups(ABOVE), 8.0
+    places = [contact.T_box_pad[1, 3] for contact in workcell.contacts]
+    moment = pull * (places[0] - places[1]) / 2.0
+    motion = carriage_motion(carry_along(workcell, np.zeros(6), 0.3), HAND_SETTINGS)
+    simulation = HandSimulation(workcell, opposed=(0.0, 0.0, pull))
+    needed = MASS * G / 2.0 + pull + moment / (RADIUS / 2.0)
+    found = bisected(partial(simulation.simulate, motion, needed), 0.9, 1.1, 4)
+    assert found.slips.lifts
+    assert found.factor == pytest.approx(1.0, abs=0.02)
+    along = HandSimulation(workcell, opposed=(0.0, pull, 0.0))
+    assert along.simulate(motion, MASS * G / 2.0 + 0.5 * pull / FRICTION).holds
+
+
 def test_a_rim_lifts_where_the_pressure_leaves_the_kern() -> None:
     """Accelerated across the line of both cups, with the centre of mass below them."""
     workcell = two_cups(ABOVE)
@@ -118,13 +143,43 @@ def test_hands_of_a_carry_need_what_the_model_says(kind: str, seed: int) -> None
     assert not simulate(0.5).holds
 
 
+def test_shorter_steps_change_nothing_where_a_payload_swings_slowly() -> None:
+    """Between facing hands, where swings grow with longer steps."""
+    carry = draw("cups beside", np.random.default_rng([9, 10]), 4.0)
+    needed = needed_force(carry)
+    assert swing_frequency(carry.workcell) * carry.duration < 10.0
+
+    def slip(step: float) -> float:
+        settings = replace(HAND_SETTINGS, time_step=step)
+        simulation = HandSimulation(carry.workcell, settings)
+        found = simulation.simulate(carriage_motion(carry, settings), 1.02 * needed)
+        assert found.holds
+        return float(found.slip[-1].max())
+
+    step = HAND_SETTINGS.time_step
+    assert slip(step) == pytest.approx(slip(step / 2.0), rel=0.05)
+
+
 @pytest.mark.slow
-def test_thresholds_of_twenty_carries_are_on_the_safe_side() -> None:
-    """Less than the model says where hands take over what another one cannot hold."""
-    for k in range(20):
+def test_thresholds_of_forty_carries_are_on_the_safe_side() -> None:
+    """As planned where a rim decides; less where others take over what one hand cannot hold."""
+    for k in range(40):
         kind = KINDS[k % len(KINDS)]
         found = threshold(kind, draw(kind, np.random.default_rng([1, k])))
-        assert 0.6 <= found.ratio <= 1.02, str(found)
+        most = 1.02 + RESOLUTION / 2.0
+        assert max(0.97 * found.rims, 0.6) <= found.ratio <= most, str(found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [6, 7, 15, 19, 21, 27, 33, 39])
+def test_a_disturbance_covers_what_slow_swings_need(seed: int) -> None:
+    """The model is quasi-static; these payloads swing fewer than 15 times in a carry."""
+    carry = draw(KINDS[seed % len(KINDS)], np.random.default_rng([1, seed]), 4.0)
+    assert swing_frequency(carry.workcell) * carry.duration < SWINGS
+    doubt = Uncertainty(disturbance=np.full(3, 0.5))
+    force = interpreted_robust_model(carry.workcell).commanded(box_motion(carry), doubt, 0).max()
+    motion = carriage_motion(carry, HAND_SETTINGS)
+    assert HandSimulation(carry.workcell).simulate(motion, force).holds
 
 
 def test_pads_that_squeeze_are_refused() -> None:
