@@ -17,16 +17,17 @@ from symbolic.robot.arm import REACH_TOLERANCE
 from symbolic.smooth.places import ManipulabilityLimit
 
 SEPARATING_AXES_BELOW = 0.1
-"""Lower bounds of the payload's distances below this are raised by separating-axis gaps [m]."""
+"""Lower bounds of the payload's distances that are smaller than this are improved by the gaps along
+separating axes [m]."""
 
 MINIMA_BELOW = 0.1
-"""Pairs that stay farther apart get no interpolated minima [m]."""
+"""Minima between places are interpolated only for pairs that come closer than this [m]."""
 
 DISTANCE_BATCH = 8
-"""Distances that are measured together in a search for the first violation."""
+"""Number of distances that are measured together in the search for the first violation."""
 
 Stretch = tuple[slice, int]
-"""Places of the path, with a stated start, and a pair."""
+"""A range of places of the path, as a slice with a start, and the index of a pair."""
 
 
 @dataclass(frozen=True)
@@ -65,12 +66,13 @@ class PlacedCarry:
 
     @property
     def is_reachable(self) -> bool:
-        """Return True if both arms reach all places."""
+        """True if both arms reach all places."""
         return self.reached == len(self.pose)
 
 
 def local_minima_below(values: Array, limit: float, stride: int | None = None) -> list[int]:
-    """Return the lowest place of every stretch below a limit, and places at a stride from it."""
+    """Return the index of the lowest value of every stretch of values (n,) below a limit. With a
+    stride, indices at this stride from it within the stretch are added."""
     below = values < limit
     if not below.any():
         return []
@@ -88,10 +90,10 @@ def local_minima_below(values: Array, limit: float, stride: int | None = None) -
 
 
 def interpolate_minima(clearance: Array) -> Array:
-    """Interpolate the minima of clearances (n, k) between places.
+    """Return clearances (n, k) lowered to their interpolated minima between places.
 
-    Where an edge is passed, the clearance falls linearly to a kink and rises linearly after it. The
-    lines from both sides meet at the minimum, which then counts at both neighbouring places.
+    Where a body passes an edge, the clearance falls linearly to a kink and rises linearly after it.
+    The lines from both sides meet at the minimum, which then counts at both neighbouring places.
     """
     low = clearance.copy()
     if len(clearance) < 4:
@@ -108,7 +110,7 @@ def interpolate_minima(clearance: Array) -> Array:
 
 
 class Distances:
-    """Distances of one candidate; each is measured on first use and stored.
+    """Distances between the bodies of one candidate. Each is measured on first use and stored.
 
     Attributes:
         bounds, interpolated_clearance: (n, n_pairs) lower bounds [m], without and with interpolated
@@ -167,10 +169,11 @@ class Distances:
         self._unmeasured[places, pairs] = False
 
     def least(self, stretches: Sequence[Stretch], below: float) -> list[float]:
-        """Return the least distance in each stretch, measured where bounds are below a limit [m].
+        """Return the least distance in each stretch [m]. Only distances with bounds below the limit
+        `below` are measured.
 
-        No distance is below its bound: the lowest unmeasured value of each stretch is measured
-        until the lowest one is measured already.
+        Because no distance is below its bound, the lowest value of a stretch is measured repeatedly
+        until the lowest one is a measured one.
         """
         open_, found = list(range(len(stretches))), [np.inf] * len(stretches)
         while open_:
@@ -187,8 +190,9 @@ class Distances:
         return found
 
     def exceed(self, limits: Array) -> bool:
-        """Return True if every pair exceeds its limit (n_pairs,) at all places [m]. The lowest are
-        measured first, until one violates its limit."""
+        """Return True if the distances of every pair exceed the pair's limit (n_pairs,) at all
+        places [m]. The pairs with the lowest bounds are measured first, until one violates its
+        limit."""
         places, pairs = (self.interpolated_clearance < limits).nonzero()
         order = np.argsort(self.interpolated_clearance[places, pairs], kind="stable")
         for first in range(0, len(order), DISTANCE_BATCH):

@@ -69,7 +69,7 @@ Indices = NDArray[np.intp]
 
 
 class PolishFunctions:
-    """Compiled functions of a workcell's programs.
+    """Compiled functions for the polish of one workcell.
 
     Attributes:
         built: by name; see `symbolic.smooth`: forces and pressure at samples, inverse kinematics of
@@ -112,10 +112,11 @@ class PolishFunctions:
 
 
 def sample_quantities(workcell: Workcell) -> tuple[Quantity, ...]:
-    """Return the quantities that a cell's programs evaluate at samples.
+    """Return the names of the quantities that the polish of a cell evaluates at samples.
 
-    Driven carries have limits at the intervals of their timing, not at samples. The forces of pads
-    anywhere have no closed form: a program finds them from the load.
+    Drivable carries have none, because their limits apply at the intervals of the timing. For pads
+    whose forces have no closed form, the quantity is the load, from which a convex program computes
+    the forces.
     """
     if workcell.task.law.is_drivable:
         return ()
@@ -189,7 +190,7 @@ def _driven_held(model: CellModel) -> dict[str, ca.Function]:
 
 
 def _names(quantities: tuple[Quantity, ...]) -> set[str]:
-    """Return the names of all functions that `polish_functions` makes."""
+    """Return the names of all functions that `polish_functions` builds for these quantities."""
     blocks = ("inner", "first", "last", "path")
     return {
         GAPS,
@@ -201,14 +202,14 @@ def _names(quantities: tuple[Quantity, ...]) -> set[str]:
 
 
 class Grid:
-    """Places along one task's path: its samples, and places between them.
+    """Places along a task's path: the samples, and places between them.
 
     Attributes:
-        per_sample: places per interval between samples.
-        parameter: (m,) of all places, in [0, 1].
-        sample_parameter: (n,) of the samples.
-        basis, rate_basis: (m, n_waypoints): poses = basis @ waypoints, and their first derivative
-            by the path parameter.
+        per_sample: number of places per interval between samples.
+        parameter: (m,) path parameter of all places, in [0, 1].
+        sample_parameter: (n,) path parameter of the samples.
+        basis, rate_basis: (m, n_waypoints) matrices: poses = basis @ waypoints, and the first
+            derivative by the path parameter = rate_basis @ waypoints.
     """
 
     def __init__(self, task: Task) -> None:
@@ -220,34 +221,37 @@ class Grid:
         self.basis, self.rate_basis = along.position, along.first
 
     def places(self, width: float) -> int:
-        """Return the number of places in a width of the path parameter, at least one."""
+        """Return the number of places in an interval of the path parameter of this width, at least
+        one."""
         return max(1, round(width * (len(self.parameter) - 1)))
 
     def samples(self, width: float) -> int:
-        """Return the number of samples in a width of the path parameter, at least one."""
+        """Return the number of samples in an interval of the path parameter of this width, at least
+        one."""
         return max(1, round(width * (len(self.sample_parameter) - 1)))
 
     def between(self, values: Array) -> Array:
-        """Interpolate values (n, k) on samples to all places (m, k)."""
+        """Interpolate values (n, k) at the samples to all places (m, k)."""
         return np.column_stack(
             [np.interp(self.parameter, self.sample_parameter, column) for column in values.T]
         )
 
     def movable(self, place: int) -> bool:
-        """Return True if a place is not one of the two fixed ends."""
+        """Return True unless the place is one of the two fixed ends of the path."""
         return 0 < place < len(self.parameter) - 1
 
 
 class SmoothCell:
-    """Shared data of all programs of a cell.
+    """Data that all programs of a cell's polish share.
 
     Attributes:
-        evaluator, functions: full model, and the programs' functions.
+        evaluator: evaluator of candidates by the full model.
+        functions: compiled functions.
         workcell, task, grid: of the evaluator.
-        clearance: distance to obstacles beyond the checker's tolerance [m].
-        robust: robust forces at samples if they are minimised, None for planned ones.
-        centre, half: (n_var,) x = centre + half * xi scales the decision vector by its bounds to
-            [-1, 1]; half is 1 for a fixed variable.
+        clearance: distance that bodies keep beyond the collision tolerance [m].
+        robust: robust forces at samples if these are minimised, None for planned forces.
+        centre, half: (n_var,) scaling of the decision vector to [-1, 1] within its bounds, x =
+            centre + half * xi; half is 1 for a fixed variable.
         free: rows and columns of the variables among the extended waypoints.
         blocks: division of the samples among functions.
         coefficients: (2, branches, 2) of `force_branches`.
@@ -258,10 +262,15 @@ class SmoothCell:
     def __init__(
         self, evaluator: CandidateEvaluator, functions: PolishFunctions, clearance: float
     ) -> None:
-        """Collect the shared data.
+        """Collect the data.
+
+        Args:
+            evaluator: evaluator of candidates by the full model.
+            functions: compiled functions.
+            clearance: distance that bodies keep beyond the collision tolerance [m].
 
         Raises:
-            SettingsError: robust forces are minimised, but the cell's pads have none.
+            SettingsError: robust forces are to be minimised, but do not exist for the cell's pads.
         """
         self.evaluator, self.functions, self.clearance = evaluator, functions, clearance
         self.workcell, self.task = evaluator.workcell, evaluator.workcell.task
@@ -285,11 +294,11 @@ class SmoothCell:
         return (x - self.centre) / self.half
 
     def unscaled(self, xi: Array) -> Array:
-        """Return variables x of scaled ones xi."""
+        """Return the decision vector x of scaled variables xi."""
         return self.centre + self.half * xi
 
     def step(self, start: Array, end: Array) -> float:
-        """Return the largest change of a scaled variable between two decision vectors."""
+        """Return the largest change of any scaled variable between two decision vectors."""
         return float(np.max(np.abs(end - start) / self.half))
 
     def waypoints(self, x: Array) -> Array:

@@ -58,39 +58,44 @@ FIRST_DRIVE_RADIUS, LEAST_DRIVE_RADIUS = 0.3, 1e-4
 solve ends."""
 
 STATIONARITY_TOLERANCE, FEASIBILITY_TOLERANCE = 1e-4, 5e-3
-"""Residuals of stationarity and complementarity, and of feasibility, at which a point counts as
-optimal: required distances change with the path."""
+"""Residuals below which a point counts as optimal: of stationarity and complementarity, and of
+feasibility. The latter is larger because required distances change with the path."""
 
 TIMING_NOISE = 5e-4
-"""Relative change of a duration below which it may be rounding of the timing."""
+"""Relative change of a duration that may be caused by rounding in the timing."""
 
 LEAST_REDUCTION_RATIO = 0.1
-"""Least accepted reduction ratio, unless rounding of the timing may hide the reduction."""
+"""Least reduction ratio of an accepted step, unless rounding in the timing may hide the
+reduction."""
 
 DRIVE_BACKTRACKING = (1.0, 0.5, 0.25, 0.125)
-"""Fractions of a step in the order of trial: an evaluation costs a tenth of an iteration."""
+"""Fractions of a rejected step, in the order in which they are tried. An evaluation costs a tenth
+of an iteration."""
 
 NEWTON_STEP = 0.05
-"""Shorter steps keep the program's squared speeds, longer ones take those of the new timing."""
+"""After shorter steps the program's squared speeds are kept; after longer ones those of the new
+timing are used."""
 
 ROW_ROUNDS, ROW_TOLERANCE = 3, 1e-6
-"""Times that rows are added to one quadratic program, and the predicted excess of a limit that adds
-its row."""
+"""Number of times that rows are added to one quadratic program, and the predicted excess over a
+limit at which its row is added."""
 
 MULTIPLIER_CURVATURE = 1.0
-"""Curvature by the path in the program that finds multipliers."""
+"""Curvature along the path variables in the program that finds multipliers."""
 
 LARGEST_NONLINEARITY = 0.2
-"""Nonlinearity of geometric rows along a step that triggers one second-order correction."""
+"""Nonlinearity of geometric rows along a step above which the step is corrected to second order
+once."""
 
 DRIVE_EXTRAPOLATION = (2.0, 4.0, 8.0)
-"""Multiples of a step that exceeded its prediction: an evaluation costs a tenth of an iteration."""
+"""Multiples of a step that are tried if its gain exceeded the prediction. An evaluation costs a
+tenth of an iteration."""
 
 LEAST_SQUARED, LARGEST_SQUARED = 0.9, 3.0
 """Largest relative fall and rise of a squared speed in a step."""
 
 UNPOLISHABLE = "the polish does not know robust forces of pads whose normals are not opposite"
-"""Reason why a cell is not `is_polishable`."""
+"""Message for cells for which `is_polishable` returns False."""
 
 REST_FORCE_MARGIN = 1e-3
 """Share by which the least force limit exceeds the force that holds the box at rest."""
@@ -165,12 +170,13 @@ def force_range(driver: CandidateDriver) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class DriveIterate(Iterate):
-    """An iterate whose level is its duration [s].
+    """An iterate of a drivable carry; its level is the duration [s].
 
     Attributes:
-        joints: at the grid points of its timing.
-        squared: (intervals + 1,) u'^2 of its timing, or predicted by a program.
-        best_level: least level so far: rounding of the timing must not accumulate.
+        joints: joint positions at the grid points of the timing.
+        squared: (intervals + 1,) squared path speeds u'^2, of the timing or predicted by a program.
+        best_level: the least level so far, against which gains are measured, so that rounding of
+            the timing does not accumulate.
     """
 
     joints: tuple[Array, Array]
@@ -184,7 +190,7 @@ class DriveStep(Step):
 
     Attributes:
         d: scaled change of the moved waypoints.
-        squared: (intervals + 1,) predicted u'^2.
+        squared: (intervals + 1,) predicted squared path speeds u'^2.
         gain: predicted relative reduction of the duration.
     """
 
@@ -195,7 +201,7 @@ class DriveStep(Step):
 
 @dataclass(frozen=True)
 class _StepAnswer:
-    """Answer of a quadratic program, and its rows."""
+    """Solution of a quadratic program, and the program's rows."""
 
     answer: QuadraticAnswer
     linear: LinearisedRows
@@ -214,13 +220,14 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
     shrinks_below_step = relaxes_until_improved = True
 
     def __init__(self, cell: SmoothCell, is_coarse: bool = False) -> None:
-        """Prepare programs.
+        """Prepare the programs of a cell.
 
         Args:
-            is_coarse: move the waypoints of the file only.
+            cell: shared data of the polish.
+            is_coarse: True to move only the waypoints of the workcell file.
 
         Raises:
-            SettingsError: the cell is not drivable, or forces have no closed form.
+            SettingsError: the cell is not drivable, or its robust forces have no closed form.
         """
         driver, task = cell.evaluator.driver, cell.task
         if driver is None or not is_polishable(cell.workcell, driver.robust):
@@ -261,7 +268,7 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         )
 
     def _moved(self, x: Array, d: Array) -> Array:
-        """Return the decision vector (n_var,) after a scaled step of the path."""
+        """Return the decision vector (n_var,) after a scaled step d of the path."""
         n, task = self._n, self.cell.task
         moved = x[:n] + self._spread @ d
         return np.append(np.clip(moved, task.lower[:n], task.upper[:n]), x[n:])
@@ -360,7 +367,16 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         box: tuple[Array, Array],
         bent: Array | float = 0.0,
     ) -> _StepAnswer | None:
-        """Solve a quadratic model, adding violated rows to it and to `chosen`."""
+        """Solve a quadratic model repeatedly, adding violated rows to it and to `chosen`; None
+        without a solution.
+
+        Args:
+            program: program of path and timing.
+            chosen: (points, kinds) mask of the timing's rows in the model.
+            model: Hessian and gradient.
+            box: lower and upper bounds of the step.
+            bent: (geometric rows,) nonlinearity along an earlier step, which is corrected.
+        """
         g = program.gradient() + model[1]
         found: _StepAnswer | None = None
         for left in reversed(range(ROW_ROUNDS)):
@@ -394,8 +410,8 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
     def _residuals(
         self, program: PathTimingProgram, best: DriveIterate, found: _StepAnswer
     ) -> Residuals:
-        """Compute the program's residuals at its iterate with a step's multipliers. Bounds count if
-        they are the variables' own, not the trust region's."""
+        """Compute the optimality residuals of an iterate with the multipliers of a step. Bounds of
+        the variables count, bounds of the trust region do not."""
         (lower, upper), n, answer = self._bounds, program.n_path, found.answer
         edge, own = 1e-6 * self._unit, answer.bounds[:n]
         reached = best.x[self._own] + self._unit * answer.d[:n]
@@ -406,7 +422,8 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         return program.residuals(bounds, found.linear, answer.rows)
 
     def solve_from(self, x: Array) -> TrustRegionSolve[DriveIterate, DriveStep]:
-        """Return the solve from a decision vector (n_var,), before its first iteration."""
+        """Return a solve that starts from a decision vector (n_var,), before its first
+        iteration."""
         return TrustRegionSolve(self, x, FIRST_DRIVE_RADIUS)
 
 

@@ -33,40 +33,40 @@ LEAST_GAP = 0.02
 """Narrower gaps are left [front's extent]."""
 
 COMPARED_LIMITS = 8
-"""Force limits at which known paths that are not on the front are compared."""
+"""Number of force limits at which known paths that are not on the front are compared."""
 
 FIRST_SWEEP_MARGIN, LAST_SWEEP_MARGIN = 0.02, 0.6
-"""First force limit of the sweep, and the one that it reaches at least, as shares above the force
+"""First force limit of the sweep, and the limit that it reaches at least, as shares above the force
 at rest."""
 
 LEAST_GAIN = 1e-3
-"""Relative reduction of the duration by two iterations in a row, below which the sweep continues
+"""Relative reduction of the duration by two successive iterations below which the sweep continues
 with the next force limit."""
 
 INTERPOLATED_SHARES = (0.125, 0.25, 0.375, 0.5, 0.625, 0.75, 0.875)
-"""Positions between two paths of the front, as shares of their distance, that are tried as
-paths."""
+"""Shares of the way between two paths of the front at which interpolated paths are tried."""
 
 MOST_DRIVE_ATTEMPTS = 10**6
-"""Attempts at most: their number follows from force limits and gaps."""
+"""Upper bound of the number of attempts, without effect: the number follows from force limits and
+gaps."""
 
 FRONT_ENDS = 2
-"""Ends of a front."""
+"""Number of ends of a front."""
 
 MOST_PATHS_TRIED = 4
-"""Paths that are evaluated per gap at most: some collide."""
+"""Largest number of paths that are evaluated per gap, because some collide."""
 
 EXTRAPOLATED_SHARES = (0.5, 1.0)
-"""Shares of the step between the last two paths of the sweep by which a start is extrapolated."""
+"""Shares of the step between the last two paths of the sweep by which starts are extrapolated."""
 
 
 @dataclass(frozen=True)
 class DriveAttempt(Attempt):
-    """An attempt at the force limit of its decision vector.
+    """An attempt at the force limit in its decision vector.
 
     Attributes:
-        moves: moved waypoints: those of the file ('stated'), 'all', or 'none' to evaluate x as it
-            is.
+        moves: which waypoints are moved: 'stated' for those of the workcell file, 'all', or 'none'
+            to evaluate x unchanged.
     """
 
     moves: Literal["stated", "all", "none"] = "stated"
@@ -77,7 +77,7 @@ class DriveGap:
     """A gap of the front.
 
     Attributes:
-        force: limit in its middle [N].
+        force: force limit in the middle of the gap [N].
         ends: indices of the points on both sides.
     """
 
@@ -86,8 +86,8 @@ class DriveGap:
 
 
 def recheck_timing(driver: CandidateDriver, model: TimingModel, x: Array) -> str:
-    """Recompute the timing of a decision vector (n_var,) on a tenfold grid; return why it fails,
-    else ''.
+    """Compute the timing of a decision vector (n_var,) again on a ten times finer grid. Return the
+    reason if it fails, else ''.
 
     Args:
         model: of the driver's workcell and intervals.
@@ -101,7 +101,7 @@ def recheck_timing(driver: CandidateDriver, model: TimingModel, x: Array) -> str
 
 
 class DriveRun(PolishRun[DriveAttempt]):
-    """One polish of drivable carries in progress."""
+    """The polish of one front of drivable carries, in progress."""
 
     def __init__(
         self,
@@ -194,7 +194,8 @@ class DriveRun(PolishRun[DriveAttempt]):
         ]
 
     def _used_force(self, index: int) -> float:
-        """Return the force limit that a known carry uses fully [N]."""
+        """Return the force that the carry at an index of the archive really uses, at most its force
+        limit [N]."""
         share = float(self._archive.objectives[index][self._by_force])
         return min(float(self._archive.x[index][-1]), share * self._reference)
 
@@ -236,8 +237,8 @@ class DriveRun(PolishRun[DriveAttempt]):
                 break
 
     def _fastest_paths(self, paths: Array) -> Array:
-        """Return those of some paths (n, n_path) that are feasible at the largest force limit and
-        the fastest at some limit."""
+        """Select the paths (n, n_path) that are feasible at the largest force limit and the fastest
+        at one of some limits."""
         x = np.hstack([paths, np.full((len(paths), 1), self._range[1])])
         paths = paths[self._evaluator.evaluate(x).feasible]
         if not len(paths):

@@ -45,48 +45,52 @@ from hybrid_opt.polishing.starts import Start, mirror_of, perturb_start, random_
 from symbolic.array import Array, evenly
 
 LEAST_MEMBER_SHARE = 0.9
-"""Share of the wanted members at which a front is complete."""
+"""Share of the wanted number of points with which a front counts as complete."""
 
 LEAST_PROGRESS = 2e-5
 """Least gain of an attempt that counts as progress [reference force]."""
 
 MIDDLE_STALLS = 1
-"""Attempts at the balanced middle in a row without progress after which it is left."""
+"""Number of successive attempts at the balanced middle without progress after which no further one
+is made."""
 
 RADIUS, SMALL_RADIUS, NEAR_RADIUS = 1.0, 0.1, 0.4
-"""First radii of trust regions: usually, after an attempt without progress, and from a neighbour on
-the front [half ranges of the decision variables]."""
+"""First radii of trust regions [half ranges of the decision variables]: the usual one, that after
+an attempt without progress, and that from a neighbour on the front."""
 
 STRIDE = 0.2
-"""Largest distance along both objectives from a neighbour to the aim of an attempt [front's
-extent]."""
+"""Largest distance along the front from a neighbour to the aim of an attempt [front's extent]."""
 
 FAR_GAP = 0.1
-"""Width above which a gap that no neighbour leads into is tried from far away."""
+"""Width above which a gap is far too wide: it is also tried with a large radius if no neighbour
+leads into it [front's extent]."""
 
 TAIL = 0.125
 """Least width of a gap as a share of its length."""
 
 LITTLE_PROGRESS = 0.3
-"""Share of its step along the front below which an attempt made little progress."""
+"""Share of its intended step along the front below which an attempt counts as having made little
+progress."""
 
 CHORD = 16
-"""Points that are evaluated on each chord."""
+"""Number of points that are evaluated on each chord."""
 
 Edge = tuple[bytes, bytes, bool]
-"""A gap from one side: decision vectors there and across, as bytes, and whether the attempt is
-near."""
+"""One side of a gap: the decision vectors on this side and on the other side, as bytes, and whether
+the attempt is near."""
 
 Chord = tuple[bytes, bytes]
-"""Ends of a chord by increasing first objective: decision vectors as bytes."""
+"""Ends of a chord, sorted by the first objective: decision vectors as bytes."""
 
 Perturbation = Callable[[Array, int], tuple[Array, Array] | None]
-"""From a decision vector and an objective to another start and its objectives; None without any."""
+"""Function from a decision vector and an objective to a perturbed start and its objectives, or
+None."""
 
 
 @dataclass(frozen=True)
 class ForceAttempt(Attempt):
-    """An attempt with a scalarisation; see `hybrid_opt.polishing.force.ForceSolver.solve`."""
+    """An attempt with a scalarisation of both peak forces, a first radius and a mode of the solver;
+    see `hybrid_opt.polishing.force.ForceSolver.solve`."""
 
     target: Scalarisation
     radius: float = RADIUS
@@ -94,7 +98,7 @@ class ForceAttempt(Attempt):
 
 
 def front_attempts(archive: ParetoArchive, settings: PolishSettings) -> list[ForceAttempt]:
-    """Return attempts at evenly spread points of the front, the balanced one among them."""
+    """Return attempts at evenly spread points of the front, which include the balanced one."""
     rows = archive.front_indices()
     count = min(len(rows), ceil(settings.attempts * OWN_SHARE))
     chosen = {rows[k] for k in evenly(len(rows), count)}
@@ -122,14 +126,17 @@ def extreme_attempt(
 ) -> ForceAttempt:
     """Return an attempt at an end of the front or at its balanced middle.
 
-    It continues from the best point. If that was tried, or brought no progress, ends start from a
-    perturbation of it: they lie in several basins. The middle then starts from any other point,
-    also a dominated one.
+    It starts from the best point so far. If that was tried or the last attempt brought no progress,
+    an attempt at an end starts from a perturbation of the best point, because ends lie in several
+    basins; an attempt at the middle starts from a random other point, which may be dominated.
 
     Args:
-        objective: of the end of the front; None for its balanced middle.
-        tried: all attempts so far, as objective and bytes of the start.
+        archive: the front so far.
+        objective: index of the objective that is least at the end; None for the balanced middle.
+        tried: objective and bytes of the start of all attempts so far.
         stalled: whether the last attempt brought no progress.
+        perturb: function that perturbs a start.
+        rng: random generator.
     """
     radius, k = RADIUS, archive.best(objective)[0]
     fresh = [row for row, x in enumerate(archive.x) if (objective, x.tobytes()) not in tried]
@@ -149,8 +156,8 @@ def extreme_attempt(
 
 
 def refinement_attempt(archive: ParetoArchive, objective: int | None) -> ForceAttempt:
-    """Return an attempt from the best point of an end, or of the balanced middle, to high
-    accuracy."""
+    """Return an attempt to solve the best point at an end, or at the balanced middle if `objective`
+    is None, to high accuracy."""
     k, span = archive.best(objective)[0], archive.span()
     x, start = archive.x[k], archive.objectives[k]
     target = scalarisation_for(start, span, objective)
@@ -159,7 +166,8 @@ def refinement_attempt(archive: ParetoArchive, objective: int | None) -> ForceAt
 
 
 def probe_attempt(start: Start, objective: int | None) -> ForceAttempt:
-    """Return a short solve from a start towards an end of the front, or its balanced middle."""
+    """Return a short solve from a start towards an end of the front, or towards the balanced middle
+    if `objective` is None."""
     target = scalarisation_for(start.objectives, np.full(2, LEAST_SPAN), objective)
     return ForceAttempt("probe", -1, start.x, start.objectives, target, mode="brief")
 
@@ -181,12 +189,12 @@ def better_half(reached: list[Start], objective: int | None) -> list[Start]:
 
 @dataclass(frozen=True)
 class GapAttempt:
-    """An attempt in a gap.
+    """An attempt to find a point in a gap.
 
     Attributes:
         attempt: the solve.
-        edge: the gap from the side of the start.
-        step: distance of the aim along the front [front's extent].
+        edge: the side of the gap that it starts from.
+        step: distance of its aim along the front [front's extent].
     """
 
     attempt: ForceAttempt
@@ -196,11 +204,12 @@ class GapAttempt:
 
 @dataclass(frozen=True)
 class ForceGap:
-    """Neighbours on a front: indices into the archive, and their distance.
+    """A gap between two neighbours on a front.
 
     Attributes:
-        first, second: by increasing first objective.
-        width: see the module.
+        first, second: indices of the neighbours in the archive, sorted by the first objective.
+        width: root of the area that a point in the gap can still dominate, at least a share of the
+            length [front's extent].
         length: sum of the differences of both objectives [front's extent].
     """
 
@@ -211,7 +220,7 @@ class ForceGap:
 
 
 def gaps(archive: ParetoArchive) -> list[ForceGap]:
-    """Return all gaps of a front, in order."""
+    """Return all gaps of a front, sorted by the first objective."""
     rows = archive.front_indices()
     scaled = np.array([archive.objectives[k] for k in rows]) / archive.span()
     sides = np.abs(np.diff(scaled, axis=0))
@@ -229,19 +238,20 @@ def gap_attempt(
     stride: float = STRIDE,
     far: float = FAR_GAP,
 ) -> GapAttempt | None:
-    """Return an attempt in the widest gap, from an untried side.
+    """Return an attempt in the widest gap, from a side that was not tried.
 
-    If the continuations from both sides failed, because the front jumps there, a far too wide gap
-    is aimed at half way with a large radius.
+    If continuations from both sides failed, because the front jumps there, and the gap is wider
+    than `far`, the attempt aims at its middle with a large radius.
 
     Args:
         archive: the front so far.
-        tried: sides of gaps that attempts started from.
-        solved: points with which the front is complete.
-        stride, far: see `STRIDE` and `FAR_GAP`.
+        tried: sides of gaps from which attempts started.
+        solved: number of points with which the front is complete.
+        stride: largest distance along the front to the aim [front's extent].
+        far: width above which a gap is far too wide [front's extent].
 
     Returns:
-        The attempt; None if the front is complete, or no side of a gap is left.
+        The attempt; None if the front is complete, or all sides of gaps were tried.
     """
     found = gaps(archive)
     if len(found) + 1 >= solved:
@@ -269,20 +279,23 @@ def gap_attempt(
 def made_little_progress(
     archive: ParetoArchive, gap_attempt: GapAttempt, objectives: Array
 ) -> bool:
-    """Return True if an attempt's result is hardly farther along the front than its start."""
+    """Return True if the result of an attempt, with these objectives (2,), is hardly farther along
+    the front than its start."""
     moved = np.abs(objectives - gap_attempt.attempt.start) / archive.span()
     return float(moved.sum()) < LITTLE_PROGRESS * gap_attempt.step
 
 
 def _target(archive: ParetoArchive, k: int, step: float) -> Scalarisation:
-    """Return the scalarisation from a member to a distance along the front."""
+    """Return the scalarisation that aims along the front from point k, by a signed step [front's
+    extent]."""
     span = archive.span()
     aside = np.array([0.5, -0.5]) * step * span
     return pascoletti_serafini(archive.objectives[k] + aside, span)
 
 
 def widest_untried_gap(archive: ParetoArchive, tried: Collection[Chord]) -> ForceGap | None:
-    """Return the widest gap with an untried chord between polished points; None without any."""
+    """Return the widest gap between two polished points whose chord was not tried, None if there is
+    none."""
     for gap in sorted(gaps(archive), key=lambda gap: -gap.width):
         is_polished = archive.polished[gap.first] and archive.polished[gap.second]
         if is_polished and chord_across(archive, gap) not in tried:
@@ -291,14 +304,14 @@ def widest_untried_gap(archive: ParetoArchive, tried: Collection[Chord]) -> Forc
 
 
 def chord_across(archive: ParetoArchive, gap: ForceGap) -> Chord:
-    """Return the chord across a gap."""
+    """Return the chord between the two points beside a gap."""
     return archive.x[gap.first].tobytes(), archive.x[gap.second].tobytes()
 
 
 def best_on_chord(
     evaluator: CandidateEvaluator, archive: ParetoArchive, gap: ForceGap
 ) -> tuple[Array, Array] | None:
-    """Return the feasible point on a chord that dominates most area of its gap.
+    """Return the feasible point on the chord of a gap that dominates the largest area of the gap.
 
     Returns:
         Decision vector (n_var,) and objectives (2,); None if all points are dominated or
@@ -317,7 +330,7 @@ def best_on_chord(
 
 
 class ForceRun(PolishRun[ForceAttempt]):
-    """One polish of both peak forces in progress."""
+    """The polish of one front of both peak forces, in progress."""
 
     def __init__(
         self,
@@ -396,8 +409,9 @@ class ForceRun(PolishRun[ForceAttempt]):
         return min(2 * self._ahead, probe.middle_starts if objective is None else count)
 
     def _remove_probes(self) -> list[tuple[Array, Array]]:
-        """Remove results of probes, except the ends and the middle, and return them: they are
-        deliberately unfinished and would stand in gaps that are to be filled."""
+        """Remove the results of probes from the archive, except those at the ends and the middle,
+        and return them. They are deliberately unfinished and would occupy gaps that are to be
+        filled."""
         archive = self._archive
         kept = {archive.best(objective)[0] for objective in (0, 1, None)}
         probed = [k for k, x in enumerate(archive.x) if x.tobytes() in self._probed]
@@ -407,7 +421,8 @@ class ForceRun(PolishRun[ForceAttempt]):
         return found
 
     def _restore_probes(self, probed: list[tuple[Array, Array]]) -> None:
-        """Add results of probes in gaps that stayed far too wide, or if the front stayed short."""
+        """Add removed results of probes again that lie in far too wide gaps or beyond the ends, or
+        all non-dominated ones if the front has fewer points than wanted."""
         for x, objectives in probed:
             wanted = self._is_short or self._is_far(objectives)
             if wanted and not self._archive.dominates(objectives):
@@ -415,11 +430,12 @@ class ForceRun(PolishRun[ForceAttempt]):
 
     @property
     def _is_short(self) -> bool:
-        """Return True if the front has fewer points than wanted."""
+        """True if the front has fewer points than wanted."""
         return len(self._archive.front_indices()) < self._settings.fill.members
 
     def _is_far(self, objectives: Array) -> bool:
-        """Return True if a point is beyond the ends of the front, or in a far too wide gap."""
+        """Return True if objectives (2,) lie beyond the ends of the front, or in a gap wider than
+        `FAR_GAP`."""
         f = [self._archive.objectives[k][0] for k in self._archive.front_indices()]
         place = int(np.searchsorted(f, objectives[0]))
         if place in (0, len(f)):
@@ -459,7 +475,8 @@ class ForceRun(PolishRun[ForceAttempt]):
                 self._add_image(found[0])
 
     def _reflected(self, edge: Edge) -> Edge:
-        """Reflect a side of a gap; return the side itself without a mirror image."""
+        """Return the mirror image of a side of a gap, or the side itself if the cell has no mirror
+        symmetry."""
         start, across, near = edge
         return self._reflected_bytes(start), self._reflected_bytes(across), near
 
@@ -479,7 +496,8 @@ class ForceRun(PolishRun[ForceAttempt]):
             self._add_image(outcome.x)
 
     def _evaluate(self, attempt: ForceAttempt, x: Array) -> Evaluations:
-        """Evaluate x (n_var,); results of probes are certified only if they stay on the front."""
+        """Evaluate x (n_var,) by the full model. Results of probes are certified only if they
+        remain on the front."""
         if attempt.mode == "brief":
             return self._evaluator.evaluate(x)
         return super()._evaluate(attempt, x)
@@ -493,8 +511,8 @@ class ForceRun(PolishRun[ForceAttempt]):
             self._unproven.add(image.tobytes())
 
     def _certify_unproven(self) -> None:
-        """Certify points that no solve made, and remove those with collisions between the samples,
-        until all points of the front are certified."""
+        """Certify the points of the front that no solve certified, and remove those that collide
+        between the samples, until all points are certified."""
         while standing := [
             k
             for k in self._archive.front_indices()

@@ -26,13 +26,13 @@ from hybrid_opt.polishing.settings import PolishSettings
 from symbolic.array import Array
 
 LEAST_SPAN = 2e-3
-"""Least scale of an objective: of a front of one point, or of a nearly flat one."""
+"""Least scale of an objective, for a front with one point or a nearly flat front."""
 
 OWN_SHARE = 1.0 / 8.0
-"""Share of the attempts at points of the given front."""
+"""Share of the attempts that start at points of the given front."""
 
 IMPROVEMENT_TOLERANCE = 1e-6
-"""Improvement of an objective below which a point counts as optimal already."""
+"""Largest improvement of an objective with which a point still counts as unimproved."""
 
 OPTIMAL_STATIONARITY = 1e-3
 """Stationarity residual below which a point without improvement counts as optimal."""
@@ -48,12 +48,12 @@ class ParetoArchive:
         self.parent, self.polished = list(parent), [False] * len(x)
 
     def replace(self, parent: int, x: Array, objectives: Array) -> None:
-        """Replace a row of the given front by a polished point."""
+        """Replace point `parent` of the given front by a polished point."""
         index = self.parent.index(parent)
         self.x[index], self.objectives[index], self.polished[index] = x, objectives, True
 
     def dominates(self, objectives: Array) -> bool:
-        """Return True if a point is at least as good in both objectives."""
+        """Return True if a point of the archive is at least as good as these objectives in both."""
         return bool(np.any(np.all(np.array(self.objectives) <= objectives, axis=1)))
 
     def add(self, x: Array, objectives: Array) -> None:
@@ -70,21 +70,21 @@ class ParetoArchive:
             values[:] = [value for k, value in enumerate(values) if k not in indices]
 
     def front_indices(self) -> list[int]:
-        """Return indices of the non-dominated points by increasing first objective."""
+        """Return the indices of the non-dominated points, sorted by the first objective."""
         values = np.array(self.objectives)
         kept = np.flatnonzero(metrics.non_dominated(values))
         return [int(k) for k in kept[np.lexsort(values[kept].T[::-1])]]
 
     def best(self, objective: int | None) -> tuple[int, float]:
-        """Return the point that is the lowest in an objective, or in the sum of both for None, and
-        its value."""
+        """Return the index of the point with the least value of an objective, or of the sum of both
+        if `objective` is None, and this value."""
         wanted = np.ones(2) if objective is None else np.eye(2)[objective]
         values = {k: float(wanted @ self.objectives[k]) for k in self.front_indices()}
         index = min(values, key=lambda k: values[k])
         return index, values[index]
 
     def span(self) -> Array:
-        """Return the range (2,) of each objective over the front, not below `LEAST_SPAN`."""
+        """Return the range (2,) of each objective over the front, at least `LEAST_SPAN`."""
         values = np.array(self.objectives)[self.front_indices()]
         return np.asarray(np.maximum(np.ptp(values, axis=0), LEAST_SPAN))
 
@@ -115,10 +115,10 @@ AnyAttempt = TypeVar("AnyAttempt", bound=Attempt)
 
 
 class PolishRun(ABC, Generic[AnyAttempt]):
-    """One polish in progress.
+    """The polish of one front, in progress.
 
     Attributes:
-        outcomes: of every attempt so far.
+        outcomes: results of all attempts so far.
     """
 
     def __init__(
@@ -242,9 +242,9 @@ class PolishRun(ABC, Generic[AnyAttempt]):
 
 
 def use_one_thread() -> None:
-    """Limit IPOPT's BLAS to one thread, so that it does not spin on cores of other workers: its
-    matrices are too small for threads. It is loaded with the first solve, too late for
-    `hybrid_opt.workers.one_thread`."""
+    """Limit IPOPT's linear algebra to one thread, so that it does not wait on cores that other
+    workers use; its matrices are too small for threads. Its library is loaded with the first solve,
+    too late for `hybrid_opt.workers.one_thread`."""
     for library in Path(casadi.__file__).parent.glob("*openblas*.so*"):
         with suppress(OSError, AttributeError):
             ctypes.CDLL(str(library)).openblas_set_num_threads(1)

@@ -36,17 +36,18 @@ from symbolic.smooth.driven import (
 from symbolic.smooth.samples import grasp_force_name
 
 GRASP_ROWS = 2
-"""Forces of a grasp's program, one per robot."""
+"""Number of forces that a grasp's program adds, one per robot."""
 
 
 @dataclass(frozen=True)
 class PointInequalities:
-    """Inequalities of one point, mix . quantities <= bound, as (k, ...) arrays.
+    """The inequalities that apply at each point, mix . quantities <= bound, as arrays over the k
+    inequalities.
 
     Attributes:
         mix: (k, quantities) coefficients.
-        is_force: (k,) whether the bound is the force limit; otherwise it is 1.
-        where, weight: (k, terms) nonzero coefficients.
+        is_force: (k,) True if the bound is the force limit, else the bound is 1.
+        where, weight: (k, terms) indices and values of the nonzero coefficients.
     """
 
     mix: Array
@@ -56,12 +57,13 @@ class PointInequalities:
 
     @classmethod
     def from_workcell(cls, workcell: Workcell, robust: int = 0) -> PointInequalities:
-        """Return a workcell's inequalities: both signs of signed quantities, all branches of the
-        forces.
+        """Return the inequalities of a workcell: both signs of signed quantities, and all branches
+        of the forces.
 
         Args:
-            robust: further forces behind the quantities, one row each, as for both forces of a
-                grasp's program.
+            workcell: the cell.
+            robust: number of further forces after the quantities, each with one inequality, as both
+                forces of a grasp's program.
         """
         layout = driven_layout(workcell)
         eye = np.eye(layout.size)
@@ -80,8 +82,12 @@ class PointInequalities:
         return cls(mix, is_force, where, np.take_along_axis(mix, where, axis=1))
 
     def slopes(self, slope: Array, point: NDArray[np.intp], kind: NDArray[np.intp]) -> Array:
-        """Return slopes (rows, ...) of some inequalities at some points, from those of the
-        quantities (points, quantities, ...)."""
+        """Return the derivatives (rows, ...) of inequalities.
+
+        Args:
+            slope: (points, quantities, ...) derivatives of the quantities.
+            point, kind: (rows,) point and inequality of each row.
+        """
         terms = zip(self.where.T, self.weight.T, strict=True)
         return sum(
             (slope[point, where[kind]] * weight[kind, None] for where, weight in terms),
@@ -90,23 +96,24 @@ class PointInequalities:
 
 
 class IntervalGrid:
-    """Shared data of all paths of a workcell with the same variables.
+    """Data that the programs of all paths of a workcell share.
 
     Attributes:
         workcell: the cell.
-        intervals: pieces of constant u''.
-        sample: (points,) grid point of each point.
-        moving: entries of the extended pose and its two derivatives, 3 (6 + m).
+        intervals: number of pieces with constant u''.
+        sample: (points,) index of the grid point of each point.
+        moving: number of entries of the extended pose and its two derivatives, 3 (6 + m).
         kinds: inequalities of a point.
         robust: robust forces, None if planned ones are limited.
-        layout: of the quantities.
-        load: slice of the load among them.
-        rest: slice of the quantities limited at rest: the pressure, else load or forces.
-        has_pressure_limit: whether the pressure is.
-        variables: of a point, see `DrivenLayout.variables`.
-        spread: (variables of the path, n_path) path by the program's variables.
-        moved: (points, moving, n_path) poses and derivatives by the program's variables.
-        threads: threads that share a batch of points.
+        layout: layout of the quantities.
+        load: slice of the load among the quantities.
+        rest: slice of the quantities that are limited at rest: the pressure, else load or forces.
+        has_pressure_limit: True if the pressure is limited at rest.
+        variables: number of variables of a point, see `DrivenLayout.variables`.
+        spread: (variables of the path, n_path) matrix from the program's variables to the path.
+        moved: (points, moving, n_path) derivatives of poses and derivatives by the program's
+            variables.
+        threads: number of threads that share the points.
     """
 
     def __init__(
@@ -140,8 +147,8 @@ class IntervalGrid:
         self.variables = self.layout.variables
 
     def by_path(self, slope: Array, points: NDArray[np.intp]) -> Array:
-        """Return slopes (rows, n_path) by the program's variables from slopes (rows, moving) at
-        points."""
+        """Convert derivatives (rows, moving) by the extended pose and its derivatives at points to
+        derivatives (rows, n_path) by the program's variables."""
         rows, columns = self.workcell.task.free_entries
         at = self.sample[points]
         by_path = sum(
@@ -162,12 +169,12 @@ class IntervalGrid:
 
 
 class IntervalValues:
-    """Limited quantities of one driven path and their derivatives.
+    """Limited quantities of one driven path, and their derivatives.
 
     Attributes:
-        value: (points, quantities), then robust forces or those of a grasp's program.
-        slope: (points, quantities, moving + 2) by the extended pose and its derivatives, u'' and
-            u'^2, with dependent joints.
+        value: (points, quantities), followed by robust forces or the forces of a grasp's program.
+        slope: (points, quantities, moving + 2) derivatives by the extended pose and its
+            derivatives, u'' and u'^2, in which the joints follow the pose.
     """
 
     def __init__(
@@ -212,11 +219,14 @@ class IntervalValues:
         self.value, self.slope = value, slope
 
     def at_rest(self, force: float) -> tuple[Array, Array]:
-        """Compute the utilisation at rest.
+        """Compute the use of the patches, or of the force limit [N], with the box at rest at the
+        beginning of every interval.
+
+        Args:
+            force: the force limit [N], which is used for pads with uniform pressure.
 
         Returns:
-            At every interval's beginning shares (rows,) of the patches, or of a force limit [N] for
-            pads with uniform pressure, and their slopes (rows, moving) by the extended pose.
+            Shares (rows,) that are used, and their derivatives (rows, moving) by the extended pose.
         """
         begins = [values[::2] for values in self._inputs]
         still, grid = np.zeros(len(begins[-1])), self._grid
@@ -232,19 +242,19 @@ class IntervalValues:
         return value.reshape(-1) / whole, slope.reshape(-1, grid.moving) / whole
 
     def rows(self) -> Array:
-        """Return mix . quantities of every inequality (points, kinds)."""
+        """Return mix . quantities for every inequality (points, kinds)."""
         return np.asarray(self.value @ self._grid.kinds.mix.T)
 
     def curvature(self, weight: Array) -> tuple[NDArray[np.intp], Array]:
-        """Compute second derivatives of weight . value.
+        """Compute the Hessian of weight . value at each point.
 
         Args:
-            weight: (points, quantities and further forces); robust forces have the curvature of
+            weight: (points, quantities and further forces). Robust forces get the curvature of
                 planned ones.
 
         Returns:
-            Points (m,) with a nonzero weight, and their second derivatives (m, moving + 2, moving +
-            2).
+            Indices (m,) of the points with a nonzero weight, and their Hessians (m, moving + 2,
+            moving + 2).
         """
         if self._grid.robust is not None:
             weight = self._grid.robust.planned_weights(weight, self.value)
@@ -292,14 +302,14 @@ class IntervalValues:
 
 
 def _by_load(pressed: Mapping[str, Array], slope: Array) -> Array:
-    """Return slopes (points, 2, ...) of a program's forces from those of their load (points, 6,
-    ...)."""
+    """Convert derivatives of the load (points, 6, ...) to derivatives of the forces (points, 2,
+    ...) that a convex program computes from it."""
     return np.asarray(pressed["slope"] @ slope)
 
 
 def _followed(grid: IntervalGrid, full: Array, follow: Sequence[Array]) -> Array:
-    """Eliminate the joints from slopes: by pose, derivatives, u'' and u'^2 with dependent
-    joints."""
+    """Eliminate the joints from derivatives, because they follow the pose. Return derivatives by
+    pose, its derivatives, u'' and u'^2."""
     slope = np.concatenate([full[:, :, : grid.moving], full[:, :, -2:]], axis=2)
     start = grid.moving
     for along in follow:
@@ -310,31 +320,31 @@ def _followed(grid: IntervalGrid, full: Array, follow: Sequence[Array]) -> Array
 
 
 NEARLY_USED = 0.85
-"""Limits with a larger utilisation have a row from the start."""
+"""Limits with a larger utilisation have a row in the program from the start."""
 
 NEARLY_USED_FORCE = 0.6
-"""Normal forces beyond this share of the difference between the limit and rest have a row from the
-start."""
+"""Normal forces above this share of the way from the force at rest to the limit have a row in the
+program from the start."""
 
 REST_MARGIN = 2e-3
-"""Share of the patches, or of the force limit, that rest leaves unused: only the intervals'
-beginnings have rows, and where rest uses all there is no timing."""
+"""Share of the patches, or of the force limit, that must remain unused at rest. Rows at rest exist
+only at the beginnings of intervals, and a path without any reserve at rest has no timing."""
 
 NEGLIGIBLE_MULTIPLIER = 1e-8
 """Scaled multipliers below this count as zero."""
 
 LEAST_SCALE = 1e-2
-"""Least slope by the squared speeds by which a row is scaled."""
+"""Least divisor of a row. A row is divided by its slope by the squared speeds."""
 
 
 @dataclass(frozen=True)
 class LinearisedRows:
-    """Rows A d <= b: chosen ones of the timing, then geometric ones.
+    """Linearised rows A d <= b for a step d: chosen rows of the timing, then all geometric rows.
 
     Attributes:
         A, b: the rows.
         scale: (rows,) divisors of the rows.
-        point, kind: (timing rows,) indices.
+        point, kind: (timing rows,) point and inequality of each row.
     """
 
     A: BorderedRows
@@ -379,13 +389,15 @@ class PathTimingProgram:
         required: Mapping[Row, float],
         carry: PlacedCarry,
     ) -> None:
-        """Form the program.
+        """Form the program about an iterate.
 
         Args:
-            values: at the iterate.
+            grid: shared data.
+            values: limited quantities of the iterate.
             x: (n_var,) decision vector of the iterate, the force limit last.
-            squared: (intervals + 1,) its u'^2.
-            required: geometric rows and their required values.
+            squared: (intervals + 1,) squared path speeds u'^2 of the iterate.
+            cell: shared data of the polish.
+            required: required value of each geometric row.
             carry: the iterate at places of the path.
         """
         self._grid, self._values, self._x, self._force = grid, values, x, float(x[-1])
@@ -409,8 +421,7 @@ class PathTimingProgram:
         self._speeds(squared)
 
     def _still(self, values: IntervalValues) -> None:
-        """Append rows of the utilisation at rest to the geometric ones; their curvature is
-        small."""
+        """Append rows for the use at rest to the geometric rows, without their small curvature."""
         share, slope = values.at_rest(self._force)
         near = np.flatnonzero(share > NEARLY_USED)
         begins = 2 * (near // (len(share) // self._grid.intervals))
@@ -419,8 +430,8 @@ class PathTimingProgram:
         self._geometry_slope = np.concatenate([self._geometry_slope, by_path])
 
     def _speeds(self, w: Array) -> None:
-        """Set the duration with its derivatives, and the slopes of u'' and u'^2 at each point by
-        omega."""
+        """Compute the duration and its derivatives, and the derivatives of u'' and u'^2 at each
+        point by omega."""
         n = self._grid.intervals
         root = np.sqrt(w)
         pair = root[:-1] + root[1:]
@@ -447,8 +458,8 @@ class PathTimingProgram:
         self._column = np.clip(np.repeat(np.arange(n), 2) - 1, 0, n - 3)
 
     def geometry_after(self, d: Array) -> Array:
-        """Compute the nonlinearity (geometric rows,) of a step: violations after it less their
-        linear prediction."""
+        """Return the nonlinearity (geometric rows,) of a step: the violations after the step minus
+        their linear prediction."""
         x, step = self._x.copy(), d[: self.n_path]
         x[: len(self._spread)] += self._spread @ step
         lacking = self._required - self._places.values(x)
@@ -458,14 +469,14 @@ class PathTimingProgram:
         return beyond
 
     def near_rows(self) -> NDArray[np.bool_]:
-        """Return (points, kinds) whether the iterate nearly uses a limit."""
+        """Return a mask (points, kinds) of the limits that the iterate nearly uses."""
         rest = min(self._grid.workcell.task.force_limit[0] / self._force, 1.0)
         for_forces = (1.0 - NEARLY_USED_FORCE) * (rest - 1.0)
         threshold = np.where(self._grid.kinds.is_force, for_forces, NEARLY_USED - 1.0)
         return np.asarray(self.rows > threshold)
 
     def predicted(self, d: Array) -> Array:
-        """Predict the timing's rows (points, kinds) after a step, linearly."""
+        """Return a linear prediction of the timing's rows (points, kinds) after a step d."""
         omega = d[self.speeds]
         moved = self._grid.moved @ d[: self.n_path]
         beside = np.stack([omega[self._column], omega[self._column + 1]], axis=1)
@@ -474,10 +485,12 @@ class PathTimingProgram:
         return np.asarray(self.rows + change @ self._grid.kinds.mix.T / self.scale)
 
     def linear(self, chosen: NDArray[np.bool_], bent: Array | float = 0.0) -> LinearisedRows:
-        """Linearise chosen rows of the timing (points, kinds), and all geometric rows.
+        """Return the linearised rows of a step.
 
         Args:
-            bent: (geometric rows,) nonlinearity to correct for.
+            chosen: (points, kinds) mask of the timing's rows that are included; all geometric rows
+                are.
+            bent: (geometric rows,) nonlinearity that is added to the geometric rows.
         """
         self._learn(*np.nonzero(chosen & ~self._known))
         point, kind = np.nonzero(chosen)
@@ -496,7 +509,8 @@ class PathTimingProgram:
         return LinearisedRows(A, b, scale, point, kind)
 
     def _learn(self, point: NDArray[np.intp], kind: NDArray[np.intp]) -> None:
-        """Compute and store slopes of some of the timing's rows."""
+        """Compute and store the derivatives of rows of the timing, given by points and
+        inequalities."""
         kinds, moving = self._grid.kinds, self._grid.moving
         local = kinds.slopes(self._values.slope, point, kind) / self.scale[kind, None]
         self._by_path[point, kind] = self._grid.by_path(local[:, :moving], point)
@@ -508,7 +522,7 @@ class PathTimingProgram:
         return np.concatenate([np.zeros(self.n_path), self.cost])
 
     def gain(self, d: Array) -> float:
-        """Return the predicted reduction of a step, as a share of the objective."""
+        """Return the predicted relative reduction of the duration by a step d."""
         omega = d[self.speeds]
         bent = self.cost_diagonal @ omega**2 / 2.0 + self.cost_beside @ (omega[:-1] * omega[1:])
         return -float(self.cost @ omega + bent)
@@ -516,8 +530,8 @@ class PathTimingProgram:
     def curvature(
         self, linear: LinearisedRows | None = None, rows: Array | None = None
     ) -> BorderedMatrix:
-        """Return the Hessian of the duration, or of the Lagrangian with multipliers (rows,) of a
-        step's rows."""
+        """Return the Hessian of the duration, or of the Lagrangian if linearised rows and their
+        multipliers (rows,) are given."""
         n_path, n = self.n_path, len(self.cost)
         corner, beside = np.zeros((n_path, n_path)), np.zeros((n, n_path))
         diagonal, off = self.cost_diagonal.copy(), self.cost_beside.copy()
@@ -547,12 +561,12 @@ class PathTimingProgram:
         return BorderedMatrix(corner, beside, diagonal, off)
 
     def residuals(self, bounds: Array, linear: LinearisedRows, multipliers: Array) -> Residuals:
-        """Compute the iterate's optimality residuals with a step's multipliers.
+        """Compute the optimality residuals of the iterate with the multipliers of a step.
 
         Args:
-            bounds: (n_variables,) signed multipliers of the path's own bounds.
-            linear: the step's rows at the iterate.
-            multipliers: (rows,) of these rows.
+            bounds: (n_variables,) signed multipliers of the variables' own bounds.
+            linear: rows of the step at the iterate.
+            multipliers: (rows,) multipliers of these rows.
         """
         lagrangian = self.gradient() + linear.A.transpose_times(multipliers) + bounds
         products = multipliers * linear.b

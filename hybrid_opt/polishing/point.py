@@ -31,8 +31,8 @@ from hybrid_opt.polishing.solvers.base import UNKNOWN, Residuals
 from symbolic.array import Array
 
 OPTIMUM_TOLERANCE = 5e-4
-"""Units of the level by which an optimum that satisfies all rows may be worse than the best
-candidate, which may satisfy fewer, and still replaces it."""
+"""Largest excess of the level [unit of the level] with which an optimum that satisfies all rows
+replaces a better candidate that may violate some."""
 
 HALVED, QUARTERED, DOUBLED = 0.5, 0.25, 2.0
 """Factors of the radius."""
@@ -59,16 +59,16 @@ class TrustRegion:
     """
 
     def __init__(self, radius: float, least: float) -> None:
-        """Start with a radius; below `least` the region is exhausted."""
+        """Start with a radius; a radius below `least` ends the solve."""
         self.radius, self._least, self._was_good = radius, least, False
 
     @property
     def is_exhausted(self) -> bool:
-        """Return True if the radius is below its least value."""
+        """True if the radius is below its least value."""
         return self.radius < self._least
 
     def is_step_bounded(self, length: float) -> bool:
-        """Return True if the box bounded a step of this length."""
+        """Return True if a step of this length was limited by the box."""
         return length >= BOUNDED_SHARE * self.radius
 
     def on_failed_subproblem(self) -> None:
@@ -80,8 +80,8 @@ class TrustRegion:
         self.radius = min(self.radius, length) * factor
 
     def on_reject(self, is_new: bool, length: float = np.inf) -> None:
-        """Shrink the radius after a rejected step, unless a violated row is new: then the model,
-        not the radius, was wrong."""
+        """Shrink the radius after a rejected step. If a violated row is new, the model was wrong
+        and not the radius, which then stays."""
         self._was_good = False
         if not is_new:
             self.radius = HALVED * min(self.radius, length)
@@ -92,9 +92,11 @@ class TrustRegion:
         """Update the radius after an accepted step of this length.
 
         Args:
-            reduction_ratio: actual over predicted reduction; None without a prediction: two
-                accepted steps in a row count then.
-            is_partial: only a fraction of the step was accepted: the radius becomes its length.
+            length: largest change of a scaled variable.
+            reduction_ratio: actual over predicted reduction; None without a prediction. The radius
+                then grows after two accepted steps in a row.
+            is_partial: True if only a fraction of the step was accepted; the radius becomes the
+                length of the fraction.
         """
         if is_partial:
             self.radius = length
@@ -108,16 +110,16 @@ class TrustRegion:
 
 @dataclass
 class Solution:
-    """Result of a trust-region solve, not yet verified.
+    """Result of a trust-region solve, not yet checked by the full evaluator.
 
     Attributes:
-        x: (n_var,) best candidate; the start without improvement.
-        message: how the solve ended.
-        converged: whether it ended at a stationary point, as the solver reports.
-        usable: whether the start could be evaluated.
-        residuals: at x, of the last iteration's program.
-        iterations, rounds: solver iterations and trust-region iterations in total.
-        rows: rows at places of the path in the program of the residuals.
+        x: (n_var,) best candidate; the start if nothing improved on it.
+        message: text on how the solve ended.
+        converged: True if it ended at a stationary point, as the solver reports.
+        usable: True if the start could be evaluated.
+        residuals: optimality residuals at x, of the last program.
+        iterations, rounds: number of solver iterations and of trust-region iterations in all.
+        rows: rows at places of the path in the last program.
     """
 
     x: Array
@@ -137,7 +139,7 @@ class Iterate:
     Attributes:
         x: (n_var,) decision vector.
         carry: the candidate at places of the path.
-        level: minimised value.
+        level: the value that is minimised.
     """
 
     x: Array
@@ -151,12 +153,12 @@ class Step:
 
     Attributes:
         length: largest change of a scaled variable.
-        required: rows of the program, and the value that each has to exceed.
-        residuals: function of an iterate that returns its optimality residuals.
-        iterations: solver iterations.
-        is_stationary: whether the iterate that it starts from is stationary.
-        converged: whether the program was solved to optimality, as the solver reports.
-        active_rows: rows at places with a multiplier.
+        required: rows of the program with the value that each has to exceed.
+        residuals: function from an iterate to its optimality residuals.
+        iterations: number of solver iterations.
+        is_stationary: True if the iterate from which the step starts is stationary.
+        converged: True if the program was solved to optimality, as the solver reports.
+        active_rows: rows at places of the path with a nonzero multiplier.
     """
 
     length: float
@@ -177,13 +179,14 @@ class StepEvaluation(Generic[AnyIterate]):
     """Evaluation of a step by the full model.
 
     Attributes:
-        trial: iterate that the step leads to; None if it is no improvement and adds no row.
-        improved: whether it reduces the level.
+        trial: iterate after the step; None if it is no improvement and adds no row.
+        improved: True if it has a lower level.
         factor: factor of the radius after a step without improvement.
         reduction_ratio: actual over predicted reduction, None without a prediction.
-        fraction: evaluated fraction of the step.
-        exceeds_prediction: the reduction is larger than predicted: longer steps are worth trying.
-        keep_active_set: keep the active set for the next subproblem.
+        fraction: fraction of the step that was evaluated.
+        exceeds_prediction: True if the reduction is larger than predicted, so that longer steps are
+            worth trying.
+        keep_active_set: True if the next program keeps the active set.
     """
 
     trial: AnyIterate | None
@@ -199,16 +202,18 @@ class StepMethod(ABC, Generic[AnyIterate, AnyStep]):
     """Objective of a solve: proposes steps and evaluates them.
 
     Attributes:
-        cell, active, reader: model, row selection and evaluation at places of the path.
-        half: (n,) half ranges of the variables that steps move.
+        cell: shared data of the polish.
+        active: selects the rows near a candidate.
+        reader: evaluates candidates at places of the path.
+        half: (n,) half ranges of the variables that steps change.
         limits: see `MinimisedForces`.
         least_radius: radius below which the solve ends.
-        shrinks_below_step: whether a rejected step reduces the radius below its own length.
-        relaxes_until_improved: whether rows require no more than the iterate satisfies until a step
+        shrinks_below_step: True if a rejected step reduces the radius below the step's own length.
+        relaxes_until_improved: True if rows require no more than the iterate satisfies until a step
             improves; otherwise only in the first iteration. A start may be nearer to obstacles than
             the wanted clearance.
         backtracking: fractions of a rejected step that are tried instead, the longest first.
-        extrapolation: multiples of a step that exceeded its prediction that are tried next, the
+        extrapolation: multiples of a step that are tried after it exceeded its prediction, the
             shortest first.
     """
 
@@ -225,33 +230,34 @@ class StepMethod(ABC, Generic[AnyIterate, AnyStep]):
 
     @abstractmethod
     def evaluate(self, x: Array) -> AnyIterate:
-        """Evaluate a candidate (n_var,)."""
+        """Evaluate a decision vector (n_var,)."""
 
     @abstractmethod
     def propose_step(
         self, best: AnyIterate, required: Mapping[Row, float], radius: float
     ) -> AnyStep | None:
-        """Propose a step within the box about the best iterate; None if the subproblem has no
-        solution."""
+        """Return a step within the box of this radius about the best iterate, such that rows exceed
+        their required values; None if the program has no solution."""
 
     @abstractmethod
     def evaluate_step(self, best: AnyIterate, step: AnyStep) -> StepEvaluation[AnyIterate]:
-        """Evaluate the candidate that a step leads to."""
+        """Evaluate the candidate after a step."""
 
     @abstractmethod
     def evaluate_fraction(
         self, begin: AnyIterate, best: AnyIterate, step: AnyStep, share: float
     ) -> AnyIterate | None:
-        """Evaluate a fraction of a step from its start; None if that does not improve the best
-        iterate."""
+        """Return the iterate after a fraction of a step from `begin`; None if it does not improve
+        on the best iterate."""
 
     def missing_rows(self, trial: AnyIterate) -> set[Row]:
-        """Return rows missing in the program of a step without improvement."""
+        """Return rows that the program of a step without improvement did not contain and should
+        have."""
         return set()
 
 
 class TrustRegionSolve(Generic[AnyIterate, AnyStep]):
-    """A trust-region solve from one start; it can be continued.
+    """A trust-region solve from one start, which can be continued.
 
     Attributes:
         solution: the result so far.
@@ -262,8 +268,9 @@ class TrustRegionSolve(Generic[AnyIterate, AnyStep]):
         """Evaluate the start.
 
         Args:
+            method: proposes and evaluates steps.
             x: (n_var,) feasible decision vector.
-            radius: of the first trust region.
+            radius: radius of the first trust region.
         """
         self._method, task = method, method.cell.task
         self.best = method.evaluate(np.clip(x, task.lower, task.upper))
@@ -275,16 +282,17 @@ class TrustRegionSolve(Generic[AnyIterate, AnyStep]):
 
     @property
     def is_finished(self) -> bool:
-        """Return True if further iterations change nothing."""
+        """True if further iterations would change nothing."""
         return self.solution.converged or self._region.is_exhausted or not self.solution.usable
 
     def run(self, rounds: int, least_gain: float = 0.0) -> Solution:
-        """Iterate, at most `rounds` times.
+        """Make at most `rounds` iterations, and return the result so far.
 
         Args:
-            least_gain: share of the level that two iterations in a row have to gain after the first
-                accepted step, or the solve is left. Before that, rejected steps add rows and say
-                nothing of gains.
+            rounds: largest number of iterations.
+            least_gain: least relative reduction of the level by two successive iterations; with
+                less, the solve is left. It applies after the first accepted step, because rejected
+                steps before it only add rows.
         """
         solution, levels = self.solution, [self.best.level]
         for _ in range(rounds):
@@ -369,8 +377,8 @@ class TrustRegionSolve(Generic[AnyIterate, AnyStep]):
         )
 
     def _keep_best(self, step: AnyStep, trial: AnyIterate) -> None:
-        """Handle a feasible step without improvement: rows were missing, or the iterate is optimal,
-        or the radius is too large."""
+        """React to a feasible step without improvement: add missing rows, or finish at an optimum,
+        or shrink the radius."""
         asked = self._method.missing_rows(trial) - step.required.keys()
         self._working_set.add(asked, trial.x)
         if step.converged and not asked and not self._region.is_step_bounded(step.length):
@@ -383,7 +391,8 @@ class TrustRegionSolve(Generic[AnyIterate, AnyStep]):
     def _try_fraction(
         self, begin: AnyIterate, step: AnyStep, share: float, keep_active_set: bool = False
     ) -> bool:
-        """Move to a fraction of a step if it improves and violates nothing; return True if so."""
+        """Accept a fraction of a step if it improves the level and violates nothing. Return True if
+        it was accepted."""
         trial = self._method.evaluate_fraction(begin, self.best, step, share)
         if trial is None or not trial.carry.is_reachable:
             return False

@@ -27,23 +27,23 @@ from symbolic.records.cell import Workcell
 from symbolic.records.task import initial_decision
 
 TIMED_EVALUATIONS = 32
-"""Candidates whose evaluation is timed, as the unit of the polish's cost."""
+"""Number of candidates whose evaluation is timed; the cost of a polish is stated in evaluations."""
 
 
 def has_polishable_forces(workcell: Workcell, objectives: Sequence[str]) -> bool:
-    """Return True if the polish has the pads' forces: planned ones of any pads, robust ones of two
-    pads with opposite normals."""
+    """Return True if the polish supports the forces in the objectives: planned forces of all pads,
+    and robust forces of two pads with opposite normals."""
     return command_model(workcell).has_scalar_squeeze or tuple(objectives) != ROBUST_OBJECTIVES
 
 
 class Polisher:
-    """Polishes fronts of one evaluator. A resource: reuse it for several fronts.
+    """Polishes fronts of one cell. Reuse one object for several fronts, because it loads functions.
 
     Attributes:
-        evaluator: evaluator of candidates with the full model.
+        evaluator: evaluator of candidates by the full model.
         settings: settings of the polish.
         solver: solver that minimises both peak forces; None in drivable cells.
-        drive_method: step method of drivable carries; None under other time laws.
+        drive_method: step method of drivable carries; None with other time laws.
     """
 
     solver: ForceSolver | None = None
@@ -136,7 +136,8 @@ class Polisher:
         )
 
     def _evaluation_seconds(self, x: Array) -> float:
-        """Measure one candidate evaluation; the initial trajectory's for an empty front."""
+        """Return the time of one candidate's evaluation [s], measured with the front's candidates,
+        or the initial trajectory for an empty front."""
         sample = x if len(x) else initial_decision(self.evaluator.workcell.task)[None]
         batch = np.resize(sample, (TIMED_EVALUATIONS, self.evaluator.n_var))
         begin = time.perf_counter()

@@ -26,7 +26,8 @@ from symbolic.smooth.places import ORDERS, PathConstraint
 from symbolic.smooth.samples import QUANTITY_WIDTHS, Quantity, grasp_force_name, sample_name
 
 PROGRAM_BRANCH = 5
-"""Branch of a force row that a grasp's program finds, after the paper's five."""
+"""Number of the branch of a force row if a convex program computes the force; the paper's five
+branches have the numbers 0 to 4."""
 
 TIME_LAW_ROUNDING = 1e-3
 """Share of a step's duration by which the paper's time law is rounded where rotation takes over
@@ -35,8 +36,8 @@ from translation: the least forces at the ends of a path are in that kink."""
 
 @dataclass(frozen=True, order=True)
 class ForceRow:
-    """One branch of one robot's normal force at a sample, or `PROGRAM_BRANCH`, bounded by its
-    peak."""
+    """One branch of a robot's normal force at a sample, bounded by the robot's peak force. The
+    branch is `PROGRAM_BRANCH` if a convex program computes the force."""
 
     robot: int
     branch: int
@@ -45,7 +46,7 @@ class ForceRow:
 
 @dataclass(frozen=True, order=True)
 class PressureRow:
-    """Margin of a robot's centre of pressure to the rim of its patch at a sample."""
+    """Distance of a robot's centre of pressure from the rim of its patch at a sample."""
 
     robot: int
     sample: int
@@ -53,7 +54,7 @@ class PressureRow:
 
 @dataclass(frozen=True)
 class PathRow:
-    """One constraint at one place of the path."""
+    """One geometric constraint at one place of the path."""
 
     constraint: PathConstraint
     place: int
@@ -64,17 +65,17 @@ Row = ForceRow | PressureRow | PathRow
 
 @cache
 def _sort_key(constraint: PathConstraint) -> tuple[str, str]:
-    """Sort by kind, then by the fields' text."""
+    """Return a key to sort constraints by kind, then by the text of their fields."""
     return constraint.family.rstrip("_0123456789"), repr(constraint)
 
 
 class RowLayout:
-    """Order of a program's rows: forces, objectives, patches, places, each block sorted.
+    """Order of a program's rows in blocks, each sorted: forces, objectives, patches, places.
 
     Attributes:
         force_rows, pressure_rows, place_rows: rows of each block.
         forces, sides, patches, places: slices of the blocks.
-        n_rows: total.
+        n_rows: number of all rows.
     """
 
     def __init__(self, rows: Iterable[Row], sides: int = 0) -> None:
@@ -91,22 +92,26 @@ class RowLayout:
 
 
 class _SampleRows:
-    """Values of some samples as functions of the decision vector.
+    """Values of a quantity at samples, as functions of the decision vector.
 
     Attributes:
-        column: (n_samples,) position of a sample among the values, -1 without.
-        found, gradients: (count, width), (count, width, n_var) of the last evaluation.
-        given: arguments of `rows.cpp`.
+        column: (n_samples,) position of each sample among the values, -1 if it is not evaluated.
+        found, gradients: (count, width) values and (count, width, n_var) gradients of the last
+            evaluation.
+        given: arguments for `rows.cpp`.
     """
 
     def __init__(
         self, cell: SmoothCell, quantity: Quantity, wanted: Collection[int], beyond: int = 0
     ) -> None:
-        """Lay out a program's samples.
+        """Arrange the samples that a program needs.
 
         Args:
-            wanted: needed samples; calls without any of them are left out.
-            beyond: number of samples that another source writes behind them.
+            cell: shared data of the polish.
+            quantity: the quantity.
+            wanted: indices of the needed samples; calls without any of them are left out.
+            beyond: number of further rows of values, which another function writes after those of
+                the samples.
         """
         built = cell.functions.built
         chosen = [
@@ -145,7 +150,8 @@ class _SampleRows:
 
 
 def _all_directions(second: NumericFunction, n: int, n_var: int) -> PreparedBatch:
-    """Prepare second derivatives along every direction of x: n_var evaluations per sample."""
+    """Prepare the second derivatives of n samples along every direction of x, n_var evaluations per
+    sample."""
     batch = second.prepared(n * n_var, ("x", "rounding"))
     batch.inputs["rounding"][...] = TIME_LAW_ROUNDING
     batch.inputs["along"][...] = np.tile(np.eye(n_var), (n, 1))
@@ -153,14 +159,15 @@ def _all_directions(second: NumericFunction, n: int, n_var: int) -> PreparedBatc
 
 
 class ConstraintRows:
-    """Rows of one program as functions of x (n_var,), and of further variables on which they depend
-    linearly. For one thread.
+    """Rows of one program as functions of x (n_var,) and, linearly, of further variables (the
+    tail). An object serves one thread.
 
-    value_r = offset_r + fixed_r . tail + own value: mix_r . (the two values of its sample), the
-    remaining patch, or a constraint at its place over its scale.
+    value_r = offset_r + fixed_r . tail + own value. The own value of a force row is mix_r . (the
+    two values of its sample), that of a pressure row the remaining patch, that of a place row a
+    constraint over its scale.
 
     Attributes:
-        offset: (n_rows,) to be written.
+        offset: (n_rows,) offsets, to be set by the caller.
     """
 
     def __init__(
@@ -171,13 +178,16 @@ class ConstraintRows:
         mix: Array | None = None,
         fixed: Array | None = None,
     ) -> None:
-        """Lay out all arrays.
+        """Arrange all arrays.
 
         Args:
-            q: both arms' joints at all places (m, n) near those that hold the box [rad].
-            mix: (n_forces, 2) coefficients of each force row's sample values: F_n and F_t for the
-                paper's branches, both normal forces for a grasp's program.
-            fixed: (n_rows, k) columns of the further variables.
+            cell: shared data of the polish.
+            layout: order of the rows.
+            q: (m, n) for each arm, joint positions at all places near those that hold the box
+                [rad].
+            mix: (n_forces, 2) coefficients of each force row: of F_n and F_t for the paper's
+                branches, of both normal forces for a grasp's program.
+            fixed: (n_rows, k) coefficients of the k further variables.
 
         Raises:
             DualArmError: a function cannot be built.
@@ -191,11 +201,11 @@ class ConstraintRows:
         )
 
     def _lay_out_samples(self, layout: RowLayout) -> dict[str, Any]:
-        """Lay out forces and pressure.
+        """Arrange the values of forces and pressure.
 
-        Forces without branches follow from a sample's load
-        (`symbolic.smooth.samples.grasp_force_functions`); their derivatives by the decision vector
-        follow by the chain rule, so that each load is solved for once.
+        Forces without closed form follow from a sample's load
+        (`symbolic.smooth.samples.grasp_force_functions`). Their derivatives follow by the chain
+        rule, so that the program is solved once per load.
         """
         cell, rows = self._cell, layout.force_rows
         own = sorted({row.sample for row in rows if row.branch == PROGRAM_BRANCH})
@@ -314,7 +324,7 @@ class ConstraintRows:
         }
 
     def values(self, x: Array, tail: Array | None = None) -> Array:
-        """Evaluate all rows (n_rows,) at x and the further variables.
+        """Return the values (n_rows,) of all rows at x and the further variables.
 
         Raises:
             CodegenError: a function failed.
@@ -324,12 +334,13 @@ class ConstraintRows:
         return np.asarray(self.offset + found)
 
     def slopes(self) -> Array:
-        """Return the slopes (n_rows, n_var + k) by all variables at the last evaluation."""
+        """Return the derivatives (n_rows, n_var + k) of all rows by all variables, at the last
+        evaluation."""
         return np.asarray(self._native.slopes())
 
     def curvature(self, multipliers: Array) -> Array:
-        """Return second derivatives (n_var, n_var) of (n_rows,) multipliers . values by x at the
-        last slopes.
+        """Return the Hessian (n_var, n_var) of multipliers . values by x, for multipliers
+        (n_rows,), at the x of the last slopes.
 
         Raises:
             CodegenError: a function failed.
@@ -338,30 +349,30 @@ class ConstraintRows:
 
     @property
     def forces(self) -> Array:
-        """Return both values (n_forces, 2) of each force row's sample at the last evaluation."""
+        """Return the two sample values (n_forces, 2) of each force row at the last evaluation."""
         return self._forces.found[self._column]
 
     @property
     def force_slopes(self) -> Array:
-        """Return the slopes (n_forces, 2, n_var) of `forces` by x; undefined for a grasp's
+        """Return the derivatives (n_forces, 2, n_var) of `forces` by x; undefined for a grasp's
         program."""
         return self._forces.gradients[self._column]
 
     @property
     def left(self) -> Array:
-        """Return the remaining patches (n_patches,) at the last evaluation."""
+        """Return the remaining shares of the patches (n_patches,) at the last evaluation."""
         return self._patches.found.ravel()[self._pressed]
 
     def correct_forces(self, slope: Array, x: Array) -> None:
-        """Add (n_forces, n_var) to the slopes of forces, and the corresponding change away from x
-        to their values."""
+        """Add a correction (n_forces, n_var) to the derivatives of force rows, and the resulting
+        change at distance from x to their values."""
         self._native.correct(slope, x)
 
 
 def row_numbers(
     constraints: Sequence[PathConstraint], functions: PolishFunctions
 ) -> tuple[Array, ...]:
-    """Return the numbers (rows, n) of constraints of one family in a tuple; an empty tuple without
-    any."""
+    """Return an array (rows, n) with the parameters of constraints of one family, as a tuple of one
+    entry; an empty tuple if the family has no parameters."""
     numbers = np.array([functions.numbers(constraint) for constraint in constraints])
     return (numbers,) if numbers.shape[1] else ()
