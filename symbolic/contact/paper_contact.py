@@ -61,8 +61,8 @@ class PaperContact(ContactModel):
 
     @property
     def force_branches(self) -> Array:
-        """Coefficients (2, 5, 2) of `normal_force_branches` by normal component and tangential
-        magnitude, for contact 1 with F_n added."""
+        """(2, 5, 2) coefficients of the five branches of each contact's normal force: of the normal
+        component F_n and of the tangential magnitude F_t of the required force."""
         f_n, f_t = ca.SX.sym("f_n"), ca.SX.sym("f_t")
         contacts = self.workcell.contacts
         second = normal_force_branches(f_n, f_t, (contacts[0].friction, contacts[1].friction))

@@ -424,7 +424,7 @@ def _moveit_mesh(
 
 
 def _triangles(name: str, vertices: Any, faces: Any, pose: Array, found: SceneBuilder) -> None:
-    """Add a mesh from vertices and vertex indices as written."""
+    """Add a mesh to the scene, given by the lists of vertices and of vertex indices in the file."""
     try:
         places = np.array(vertices, dtype=float).reshape(-1, 3)
         corners = np.array(faces, dtype=float).reshape(-1, 3)

@@ -291,13 +291,13 @@ def row_function(place: PathPointSymbols, constraint: PathConstraint, order: Ord
 
 
 def closure_functions(model: CellModel, arm: int) -> dict[str, ca.Function]:
-    """Build the functions of an arm's joints by the box pose, and of the matrices for derivatives
-    of rows.
+    """Build the functions with which an arm's joints follow the box pose, by name. The symbols are
+    those of the module's formulas.
 
-    first: pose (6 + m,), q_reference (n,) -> q (n,) that hold the box; follow dq/dpose (n, 6 + m);
-    pull -F_q^-1 (n, n), so that nu = pull^T c_q.
+    first: pose (6 + m,) and q_reference (n,) -> q (n,), the joints that hold the box; follow (n, 6
+    + m), the derivative dq/dpose; pull (n, n), the matrix -F_q^-1, so that nu = pull^T c_q.
 
-    second: pose, q, nu (n,) -> hessian (6 + m + n, 6 + m + n) of nu . F by (pose, q).
+    second: pose, q and nu (n,) -> hessian (6 + m + n, 6 + m + n) of nu . F by (pose, q).
     """
     own = model.robots[arm]
     n = own.n_joints

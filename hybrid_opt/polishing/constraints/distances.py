@@ -100,8 +100,8 @@ class DistanceConstraintKind(ConstraintKind[PathRow]):
         return values.tolist()
 
     def violations(self, carry: PlacedCarry) -> dict[int, Array]:
-        """Return the distances (reached,) [m] along the path of every pair that is too close, by
-        pair."""
+        """Return for every pair that is too close its distances (reached,) along the path [m], by
+        the index of the pair."""
         close = carry.distances.interpolated_clearance < self.least
         pairs = np.flatnonzero(close.any(axis=0)).tolist()
         truth = carry.distances.at(close)
@@ -143,7 +143,8 @@ class SeparatingAxisGaps(DistanceConstraintKind):
     """Rows of single gaps between the payload and a box, away from kinks."""
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows at a few places of every stretch along which the payload is near."""
+        """Return rows at a few places of every stretch of the path along which the payload is near
+        a box."""
         grid = self.grid
         beside = grid.places(BESIDE_KINK)
         stretches = (
@@ -162,8 +163,9 @@ class SeparatingAxisGaps(DistanceConstraintKind):
                 yield separation(pair, gaps, place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return rows at places that are too close and far from every kink of the known candidate.
-        Each row has the direction of the known candidate's largest gap."""
+        """Return rows at the places where the payload is too close to a box, except near kinks
+        of the known candidate. Each row has the direction of the largest gap of the known
+        candidate."""
         half = self.grid.places(KINK_WINDOW) // 2
         for pair, gaps, place, near in violated_passages(self, carry, known):
             if not near:
@@ -180,13 +182,14 @@ class AxisSwitchGaps(DistanceConstraintKind):
         self.window = cell.grid.places(KINK_WINDOW)
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows of the kinks with a small height."""
+        """Return rows for the kinks of the clearance that are lower than `KINK_DISTANCE`."""
         for pair, gaps in near_gaps(self, carry):
             for kink, place in edges(gaps, KINK_DISTANCE):
                 yield passing(pair, gaps, kink, place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return rows of the known candidate's kinks near places that are too close."""
+        """Return rows for kinks of the known candidate that lie near places where the new candidate
+        is too close to a box."""
         for pair, gaps, _, near in violated_passages(self, carry, known):
             for kink, place in near:
                 yield passing(pair, gaps, kink, place)
@@ -214,8 +217,8 @@ class Gaps:
 
 
 def edges(gaps: Gaps, limit: float) -> list[tuple[int, int]]:
-    """Return the kinks below a limit [m]. Each is a pair: the place before the kink, and the lower
-    of its two neighbouring places."""
+    """Return the kinks of the clearance below a limit [m]: for each the index of the place before
+    the kink, and the index of the lower one of both neighbouring places."""
     best, height, along = gaps.best, gaps.height, gaps.along
     return [
         (k, k + int(height[k + 1] < height[k]))
@@ -227,18 +230,18 @@ def edges(gaps: Gaps, limit: float) -> list[tuple[int, int]]:
 
 
 def passing(pair: int, gaps: Gaps, kink: int, place: int) -> PathRow:
-    """Return the row of a kink that `edges` found."""
+    """Return the row for a kink found by `edges`."""
     before, after = (int(gaps.best[k]) for k in (kink, kink + 1))
     return PathRow(AxisSwitchGap(pair, before, after), place)
 
 
 def separation(pair: int, gaps: Gaps, place: int) -> PathRow:
-    """Return the row of the largest gap at a place."""
+    """Return the row for the largest gap at a place."""
     return PathRow(SeparatingAxisGap(pair, int(gaps.best[place])), place)
 
 
 def near_gaps(kind: DistanceConstraintKind, carry: PlacedCarry) -> Iterable[tuple[int, Gaps]]:
-    """Yield every separable pair that comes near, with its gaps."""
+    """Yield every separable pair that comes nearer than `FAR_GAP_DISTANCE`, with its gaps."""
     for pair in np.flatnonzero(carry.distances.bounds.min(axis=0) < FAR_GAP_DISTANCE).tolist():
         if pair in kind.separable:
             yield pair, Gaps.from_values(carry.gaps(pair))
@@ -247,8 +250,8 @@ def near_gaps(kind: DistanceConstraintKind, carry: PlacedCarry) -> Iterable[tupl
 def violated_passages(
     kind: DistanceConstraintKind, carry: PlacedCarry, known: PlacedCarry
 ) -> Iterable[tuple[int, Gaps, int, list[tuple[int, int]]]]:
-    """Yield the places at which a separable pair is too close: the pair, the gaps of the known
-    candidate, the place, and the known candidate's kinks near it."""
+    """Yield each place at which a separable pair is too close, as the index of the pair, the gaps
+    of the known candidate, the place, and the kinks of the known candidate near the place."""
     window = kind.grid.places(KINK_WINDOW)
     for pair, distance in kind.violations(carry).items():
         if pair not in kind.separable:

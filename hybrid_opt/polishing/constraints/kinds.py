@@ -136,7 +136,8 @@ class Forces(ConstraintKind[ForceRow]):
         self._main = PROGRAM_BRANCH if by_program else CONE_TIGHT
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[ForceRow]:
-        """Return rows at every few samples, and at the peaks and beside them."""
+        """Return force rows at a stride along the path, at the peaks of the force and beside
+        them."""
         samples = self._every | self._ends | self._peaks(carry)
         for robot, limited in enumerate(limits):
             for sample in samples if limited else samples & self._ties:
@@ -144,11 +145,11 @@ class Forces(ConstraintKind[ForceRow]):
         yield from self._other_branches(carry)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[ForceRow]:
-        """Return rows of the other branches where they govern."""
+        """Return rows for the other branches at samples where they govern the force."""
         return self._other_branches(carry)
 
     def peak_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> set[ForceRow]:
-        """Return rows at the peaks of a candidate, which the program underestimated."""
+        """Return rows at the peaks of a candidate's forces, which the program underestimated."""
         return {
             ForceRow(robot, self._main, sample)
             for robot, limited in enumerate(limits)
