@@ -131,7 +131,8 @@ class Squeeze:
 
     @property
     def breakdown(self) -> str:
-        """The contributions as a sum."""
+        """The contributions to the force as a sum in text, such as '70.0 least force + 10.0
+        friction = 80.0 N'."""
         return breakdown_text(self.parts)
 
     def __str__(self) -> str:

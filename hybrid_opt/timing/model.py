@@ -487,7 +487,8 @@ class SpeedProfile:
 
     @classmethod
     def from_grid_speed(cls, grid_speed: Array) -> SpeedProfile:
-        """Sample path speeds u' at the grid points (intervals + 1,) [1/s]."""
+        """Return the profile with the path speeds u' (intervals + 1,) at the grid points [1/s], and
+        constant u'' between them."""
         squared, intervals = grid_speed**2, len(grid_speed) - 1
         share = np.linspace(0.0, 1.0, REFINEMENT + 1)
         w = squared[:-1, None] + np.outer(np.diff(squared), share)
