@@ -38,6 +38,9 @@ LEAST_LEVEL = 0.1
 PROPOSED = ("waypoints", "initial", "redundant")
 """Keys of the task that are always proposed anew."""
 
+MOST_SIDES = 3
+"""Places of hands with which bases are searched, the best."""
+
 DRAFT_ROOM = 0.01
 """Half-width of provisional bounds, without meaning [m, rad]."""
 
@@ -96,7 +99,8 @@ class Problem:
         """
         entries = self.data["contacts"]
         if all("xyz" in entry for entry in entries):
-            return [{"xyz": entry["xyz"]} for entry in entries]
+            keys = ("xyz", "spin", "further") if self.has_hands else ("xyz",)
+            return [{key: entry[key] for key in keys if key in entry} for entry in entries]
         if self.has_hands:
             return self._hand_places[0]
         bases = self._bases
@@ -136,12 +140,16 @@ class Problem:
             raise WorkcellError(str(self.source), problems.messages())
         R = box_placement(self.orientation, np.array(self.poses))[:, :3, :3]
         bases = np.zeros((2, 3)) if self._bases is None else self._bases
+        anywhere = [
+            {} if "base" in robot else {"base": {"xyz": [0.0, y, 0.0]}}
+            for robot, y in zip(self.data["robots"], (1.0, -1.0), strict=True)
+        ]
         found = hand_places(
             patterns,
             size,
             R,
             (bases[0] - bases[1]) @ R[0],
-            lambda contacts: self.workcell({"contacts": contacts}),
+            lambda contacts: self.workcell({"contacts": contacts, "robots": anywhere}),
         )
         if not found:
             told = (
@@ -184,6 +192,9 @@ class Problem:
         or if a level carry past two robots determines the faces."""
         entries = self.data["contacts"]
         start, goal = self.poses
+        if self.has_hands and not all("xyz" in entry for entry in entries):
+            placed = [merged(entries, place) for place in self._hand_places[:MOST_SIDES]]
+            return [replace(self, data={**self.data, "contacts": each}) for each in placed]
         level = float(np.linalg.norm((goal - start)[:2]))
         if all("xyz" in entry for entry in entries) or not (self.is_machine or level < LEAST_LEVEL):
             return [self]

@@ -80,6 +80,20 @@ def test_a_place_is_read_as_it_was_written(name: str) -> None:
         np.testing.assert_allclose(entry["xyz"], turned.T_box_pad[:3, 3], atol=1e-9)
 
 
+def test_places_come_before_bases() -> None:
+    """Without bases no arm is nearer to a side; each place is a problem of its own then."""
+    given = read_problem(CUPS)
+    robots = [{k: v for k, v in r.items() if k != "base"} for r in given.data["robots"]]
+    problem = replace(given, data={**given.data, "robots": robots})
+    sides = problem.sides()
+    assert len(sides) == 3
+    for side in sides:
+        assert all("xyz" in contact for contact in side.data["contacts"])
+        entries = side.data["contacts"]
+        # What a choice of bases passes on is the whole place.
+        assert side.contacts == [{k: e[k] for k in ("xyz", "spin", "further")} for e in entries]
+
+
 def test_hands_without_room_are_refused() -> None:
     problem = read_problem(CUPS)
     wide = [entry | {"patch_radius": 0.3} for entry in problem.data["contacts"]]
