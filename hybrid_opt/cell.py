@@ -277,7 +277,7 @@ class Cell:
         """Collision bodies, and the pairs of bodies that are checked for collision."""
         return self.evaluator.checker.geometry
 
-    @property
+    @cached_property
     def force_kind(self) -> ForceKind:
         """Kind of force that the limits of drivable carries bound.
 

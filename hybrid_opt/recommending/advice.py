@@ -17,7 +17,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.recommending.choice import DrivenPaths, Option
 from hybrid_opt.robust.cases import LEADER, nominal_case
-from hybrid_opt.robust.force import HOLDS, BoxMotion, robust_model, subsample
+from hybrid_opt.robust.force import HOLDS, BoxMotion, RobustModel, robust_model, subsample
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import Margin
 from symbolic.array import Array
@@ -136,7 +136,9 @@ def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tu
     limits = np.minimum(
         FORCE_MULTIPLES * option.limit, max(paths.highest_force, option.limit)
     ).tolist()
-    near = [each for limit in limits for each in paths.options(limit, [option.index])]
+    near: list[Option] = []
+    for limit in limits:
+        near += paths.options(limit, [option.index])
     forces = np.maximum.accumulate([each.commanded for each in near])
     durations, steps = np.array([each.duration for each in near]), np.flatnonzero(np.diff(forces))
     slope = 0.0
@@ -151,10 +153,9 @@ def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tu
         lost = max(forces[0] - (option.commanded - force), 0.0)
         return float(spare - slope * lost - np.interp(option.commanded, forces, durations))
 
-    found = [
-        Advice(change, force, in_time(force))
-        for change, force in changes_of_cell(cell.workcell, subsample(timing.carry)[1])
-    ]
+    found = list[Advice]()
+    for change, force in changes_of_cell(cell.workcell, subsample(timing.carry)[1]):
+        found.append(Advice(change, force, in_time(force)))
     found += _of_pitch(cell, paths.x[option.index], option, slope)
     return tuple(sorted(found, key=lambda each: each.force))
 
@@ -164,11 +165,7 @@ def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str
     motion [N]. Where a change makes hands stronger, it is the rise of the same share of today's
     holding force."""
     doubt = workcell.uncertainty
-
-    def needed(cell: Workcell, motion: BoxMotion) -> Array:
-        return robust_model(cell).commanded(motion, doubt, LEADER)
-
-    now = needed(workcell, motion)
+    now = robust_model(workcell).commanded(motion, doubt, LEADER)
     at = motion.at(np.argsort(-now)[:LOOKED_AT])
     up, height = _height(workcell)
     changes: dict[str, Callable[[Contact], Contact]] = {
@@ -184,13 +181,15 @@ def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str
         changes["pads 1 mm lower"] = partial(_moved, by=-MILLIMETRE * up)
     for name, change in changes.items():
         other = _with_pads(workcell, change)
-        yield name, float(needed(other, at).max() / _strength(workcell, other) - now.max())
+        needed = RobustModel(other).commanded(at, doubt, LEADER)
+        yield name, float(needed.max() / _strength(workcell, other) - now.max())
     if is_held_at_sides and abs(height) > LEAST_HEIGHT:
         level = _with_pads(workcell, partial(_moved, by=-height * up))
+        needed = RobustModel(level).commanded(motion, doubt, LEADER)
         side = "above" if height > 0.0 else "below"
         yield (
             f"pads at the height of the centre of mass, now {1e3 * abs(height):.0f} mm {side} it",
-            float(needed(level, motion).max() - now.max()),
+            float(needed.max() - now.max()),
         )
 
 

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symbolic.array import Array
-from symbolic.contact.registry import command_model
+from symbolic.contact.model import ContactModel
 from symbolic.records import Uncertainty, Workcell
 
 LEADER, FOLLOWER = 0, 1
@@ -50,19 +50,20 @@ def nominal_case(workcell: Workcell) -> Array:
     )
 
 
-def worst_cases(workcell: Workcell, uncertainty: Uncertainty, leader: int = 0) -> Array:
+def worst_cases(contact: ContactModel, uncertainty: Uncertainty, leader: int = 0) -> Array:
     """Return worst cases (k, 18) of an uncertainty: the largest squeeze among them suffices for
     every case within the ranges.
 
     Args:
+        contact: contact model of the workcell's commanded forces.
         leader: index of the robot whose force is not commanded.
     """
-    case = nominal_case(workcell)
-    case[0:2] = command_model(workcell).least_friction(uncertainty)
+    case = nominal_case(contact.workcell)
+    case[0:2] = contact.least_friction(uncertainty)
     case[4] *= 1.0 + uncertainty.mass
     case[16 - leader] = uncertainty.tracking
     case[17] = uncertainty.opposed_force
-    centre, places = command_model(workcell).worst_displacements(uncertainty)
+    centre, places = contact.worst_displacements(uncertainty)
     ranges = np.concatenate([centre, uncertainty.disturbance])
     corners = product(*[(-width, width) if width > 0.0 else (0.0,) for width in ranges])
     return np.array(

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
-from functools import cached_property, lru_cache, partial
+from functools import cache, cached_property, partial
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -29,6 +29,7 @@ from hybrid_opt.robust.cases import (
     worst_cases,
 )
 from symbolic.array import Array, Count, Figure, Pair, Row, Shape, evenly
+from symbolic.contact.model import ContactModel
 from symbolic.contact.registry import command_model
 from symbolic.contact.worst_cases import (
     case_slack_function,
@@ -36,7 +37,6 @@ from symbolic.contact.worst_cases import (
 )
 from symbolic.errors import SettingsError
 from symbolic.records import Uncertainty, Workcell
-from symbolic.records.content import CacheKey
 
 if TYPE_CHECKING:
     import casadi as ca
@@ -47,6 +47,9 @@ BATCH = 100_000
 SCREENING_SAMPLES, GOVERNING_CASES = 3, 4
 """Number of samples at which governing cases are sought, and number of these cases at each
 sample."""
+
+LATEST_SETS = 8
+"""Uncertainty sets whose worst cases are remembered."""
 
 BISECTIONS = 30
 LARGEST_FACTOR, FACTOR_ERROR = 20.0, 1e-6
@@ -193,16 +196,13 @@ class RobustModel:
         """
         if problem := command_model(workcell).problem:
             raise SettingsError(": ".join(problem))
-        self.workcell = workcell
-        self._load = load
-        self._functions: dict[tuple[object, ...], NumericFunction] = {}
-        # A few sets serve many motions.
-        self._worst = lru_cache(maxsize=8)(self._checked_cases)
-        self._one = command_model(workcell).has_scalar_squeeze
+        self._load, self._one = load, command_model(workcell).has_scalar_squeeze
+        self._squeeze, self._slack = cache(self._squeeze_function), cache(self._slack_function)
+        self._describe(workcell)
         if self._one:
-            self._squeeze(1, displaced=True)
-            self._squeeze(1, displaced=False)
-            self._function(case_slack_function, commanded=1)
+            self._squeeze(1, True)
+            self._squeeze(1, False)
+            self._slack(1)
 
     def with_workcell(self, workcell: Workcell) -> RobustModel:
         """Return a model of another workcell with the same compiled functions.
@@ -211,21 +211,25 @@ class RobustModel:
             workcell: workcell that differs only in friction, mass and uncertainty.
         """
         other = copy(self)
-        other.workcell = workcell
-        other._worst = lru_cache(maxsize=8)(other._checked_cases)
+        other._describe(workcell)
         return other
 
-    def _function(self, make: Callable[..., ca.Function], **given: object) -> NumericFunction:
-        key = (make.__name__, *given.values())
-        if key not in self._functions:
-            name, of = " ".join(map(str, key)), partial(make, **given)
-            self._functions[key] = self._load(self.workcell, name, of, lanes=0)
-        return self._functions[key]
+    def _describe(self, workcell: Workcell) -> None:
+        """Take what the cases of a workcell are made from."""
+        self.workcell, self._contact = workcell, command_model(workcell)
+        self._nominal = nominal_case(workcell)[None]
+        self._worst: dict[tuple[int, int], tuple[Uncertainty, Array]] = {}
 
-    def _squeeze(self, commanded: int, displaced: bool) -> NumericFunction:
+    def _squeeze_function(self, commanded: int, displaced: bool) -> NumericFunction:
         # Functions of pads with any normals depend on the robot, and always allow displacements.
         commanded, displaced = (1, displaced) if self._one else (commanded, True)
-        return self._function(case_squeeze_function, commanded=commanded, displaced=displaced)
+        name = f"case_squeeze_function {commanded} {displaced}"
+        make = partial(case_squeeze_function, commanded=commanded, displaced=displaced)
+        return self._load(self.workcell, name, make, lanes=0)
+
+    def _slack_function(self, commanded: int) -> NumericFunction:
+        make = partial(case_slack_function, commanded=commanded)
+        return self._load(self.workcell, f"case_slack_function {commanded}", make, lanes=0)
 
     def worst_cases(self, uncertainty: Uncertainty, leader: int) -> Array:
         """Return the worst cases (k, 18) of an uncertainty, read-only.
@@ -233,17 +237,20 @@ class RobustModel:
         Raises:
             SettingsError: the uncertainty leaves no friction or patch.
         """
-        return self._worst(CacheKey(uncertainty, leader, known=(id(uncertainty), leader)))
-
-    def _checked_cases(self, seen: CacheKey) -> Array:
-        uncertainty, leader = seen.given
-        if not _has_positive_remainders(self.workcell, uncertainty):
-            raise SettingsError(
-                "the uncertainty leaves no friction or no patch; make its shares, tilt or "
-                f"displacements smaller ({uncertainty})",
-                code="no-friction",
-            )
-        return worst_cases(self.workcell, uncertainty, leader)
+        key = id(uncertainty), leader
+        if key not in self._worst:
+            if not _has_positive_remainders(self._contact, uncertainty):
+                raise SettingsError(
+                    "the uncertainty leaves no friction or no patch; make its shares, tilt or "
+                    f"displacements smaller ({uncertainty})",
+                    code="no-friction",
+                )
+            cases = worst_cases(self._contact, uncertainty, leader)
+            cases.flags.writeable = False
+            # A few sets serve many motions; each is kept alive, so that no other takes its id.
+            self._worst = dict([*self._worst.items()][-LATEST_SETS + 1 :])
+            self._worst[key] = uncertainty, cases
+        return self._worst[key][1]
 
     def least(
         self, motion: HeldMotion, cases: Array, leader: int, threads: int, displaced: bool
@@ -268,9 +275,8 @@ class RobustModel:
         """Compute the slack (m,) of one case per sample under commanded forces (m,) [N], by
         `case_slack_function`. A positive slack proves that the force holds the case; a negative
         slack proves nothing."""
-        function = self._function(case_slack_function, commanded=1 - leader)
         given = *motion_inputs(motion), cases, force
-        return function.batch(*given, threads=threads)["slack"].ravel()
+        return self._slack(1 - leader).batch(*given, threads=threads)["slack"].ravel()
 
     def least_squeeze(self, motion: HeldMotion, cases: Array, leader: int = 0) -> Array:
         """Compute the least normal forces (k, n, 2) of both robots [N] for k cases at n samples.
@@ -293,13 +299,13 @@ class RobustModel:
 
     def nominal(self, motion: HeldMotion, leader: int = 0) -> Array:
         """Compute the least normal forces (n, 2) of both robots that hold the nominal case [N]."""
-        return np.asarray(self.least_squeeze(motion, nominal_case(self.workcell)[None], leader)[0])
+        return np.asarray(self.least_squeeze(motion, self._nominal, leader)[0])
 
     @cached_property
     def leading_share(self) -> Array:
         """Rise of the leading arm's force per newton of commanded force, for either arm leading
         (2,)."""
-        return command_model(self.workcell).leading_share
+        return self._contact.leading_share
 
     def hold(
         self,
@@ -360,7 +366,7 @@ class RobustModel:
         cases, n = self.worst_cases(uncertainty, leader), len(motion.pose)
         few = evenly(n, SCREENING_SAMPLES)
         at_few = box_motion(motion).at(few)
-        planned = self.nominal(at_few, leader)[:, 1 - leader]
+        planned = self.least_squeeze(at_few, self._nominal, leader)[0, :, 1 - leader]
         rows, every = tile_motion(at_few, len(cases)), np.repeat(cases, len(few), axis=0)
         slack = self.slack(rows, every, np.tile(planned, len(cases)), leader)
         governing = np.unique(slack.reshape(len(cases), -1).argsort(axis=0)[:GOVERNING_CASES])
@@ -477,7 +483,7 @@ class RobustModel:
         """Compute the least share of friction that displaced pads leave. `slack` does not know
         displacements."""
         apart = np.linalg.norm(cases[:, 11:13] - cases[:, 13:15], axis=1)
-        lost = command_model(self.workcell).friction_lost(apart) / cases[:, :2].min(axis=1)
+        lost = self._contact.friction_lost(apart) / cases[:, :2].min(axis=1)
         return SCREEN_SHARE * max(0.0, 1.0 - float(lost.max()))
 
     def largest_factor(self, motion: HeldMotion, limit: Array, leader: int = 0) -> float:
@@ -497,21 +503,20 @@ class RobustModel:
 def allowed_factor(workcell: Workcell, uncertainty: Uncertainty) -> float:
     """Find the largest multiple of an uncertainty that leaves some friction and patch, at most
     `LARGEST_FACTOR`."""
-    low, high = 0.0, LARGEST_FACTOR
-    if _has_positive_remainders(workcell, uncertainty.scaled(high)):
+    low, high, contact = 0.0, LARGEST_FACTOR, command_model(workcell)
+    if _has_positive_remainders(contact, uncertainty.scaled(high)):
         return high
     for _ in range(BISECTIONS):
         middle = (low + high) / 2.0
-        leaves = _has_positive_remainders(workcell, uncertainty.scaled(middle))
+        leaves = _has_positive_remainders(contact, uncertainty.scaled(middle))
         low, high = (middle, high) if leaves else (low, middle)
     return low
 
 
-def _has_positive_remainders(workcell: Workcell, uncertainty: Uncertainty) -> bool:
+def _has_positive_remainders(contact: ContactModel, uncertainty: Uncertainty) -> bool:
     """Return True if friction, patches, mass and force are positive in the worst case."""
     shares = [1.0 - uncertainty.mass, 1.0 - uncertainty.tracking]
-    model = command_model(workcell)
-    left = [*model.least_friction(uncertainty), model.displacement_margin(uncertainty), *shares]
+    left = [*contact.least_friction(uncertainty), contact.displacement_margin(uncertainty), *shares]
     return bool(min(left) > 0.0)
 
 

@@ -225,7 +225,7 @@ class GoverningForce:
         self._squeezed = command_model(model.workcell).has_scalar_squeeze
         needed = model.commanded(carry, carry.workcell.uncertainty, leader)
         few = np.flatnonzero(needed >= (1.0 - TIED) * needed.max())
-        cases = worst_cases(model.workcell, carry.workcell.uncertainty, leader)
+        cases = worst_cases(command_model(model.workcell), carry.workcell.uncertainty, leader)
         least = model.least_squeeze(box_motion(carry).at(few), cases, leader)[:, :, 1 - leader]
         self.force = float(least.max())
         self._governing, at = np.nonzero(least >= (1.0 - TIED) * self.force)
@@ -265,7 +265,7 @@ class GoverningForce:
     def _inputs(self, cell: Workcell, motion: BoxMotion, pads: bool) -> Array:
         """Compute the inputs (k, m) of the gradient. For pads without opposite normals that differ,
         compute the forces (k, 1) instead."""
-        cases = worst_cases(cell, cell.uncertainty, self._leader)
+        cases = worst_cases(command_model(cell), cell.uncertainty, self._leader)
         assert len(cases) == self._count, "no range of the uncertainty begins or ends"
         cases = cases[self._governing]
         moved = np.hstack([*motion_inputs(motion), cases])

@@ -21,6 +21,7 @@ from scipy.ndimage import maximum_filter1d
 from hybrid_opt.carry import Carry
 from hybrid_opt.robust.force import (
     HeldMotion,
+    RobustModel,
     at_standstill,
     box_motion,
     robust_model,
@@ -172,17 +173,16 @@ def extra_normal_force(
     Raises:
         SettingsError: the uncertainty leaves no friction or patch.
     """
-    leader, contact = settings.leader, command_model(workcell)
+    leader, contact, model = settings.leader, command_model(workcell), robust_model(workcell)
     planned, uncertainty = least[:, 1 - leader], workcell.uncertainty
     if settings.factor is None:
-        needed = _in_every_case(workcell, uncertainty, leader, motion, planned)
+        needed = _in_every_case(model, uncertainty, leader, motion, planned)
         parts = [Contribution("in every case", float(needed.max()))]
         if itemised:
             most = np.union1d(np.argsort(-needed)[:MOST], np.argsort(-planned)[:MOST])
             there = box_motion(motion).at(most)
-            parts = _contributions(workcell, leader, there, planned[most])
+            parts = _contributions(model, leader, there, planned[most])
     else:
-        model = robust_model(workcell)
         least = np.maximum(least, model.nominal(motion, leader))
         still = model.nominal(at_standstill(motion), leader)[:, 1 - leader]
         held = least[:, 1 - leader]
@@ -203,20 +203,20 @@ def extra_normal_force(
 
 
 def _contributions(
-    workcell: Workcell, leader: int, motion: HeldMotion, planned: Array
+    model: RobustModel, leader: int, motion: HeldMotion, planned: Array
 ) -> list[Contribution]:
     """Compute by how much each source of uncertainty, added in order, raises the largest robust
     force."""
-    uncertainty, names = workcell.uncertainty, tuple[str, ...]()
+    uncertainty, names = model.workcell.uncertainty, tuple[str, ...]()
     before = float(
-        _in_every_case(workcell, uncertainty.restrict_to(names), leader, motion, planned).max()
+        _in_every_case(model, uncertainty.restrict_to(names), leader, motion, planned).max()
     )
     parts = [Contribution("least force", before)]
     for name, ranges in UNCERTAINTY_SOURCES.items():
         names += ranges
         if not uncertainty.restrict_to(ranges).is_empty:
             force = _in_every_case(
-                workcell, uncertainty.restrict_to(names), leader, motion, planned
+                model, uncertainty.restrict_to(names), leader, motion, planned
             ).max()
             parts.append(Contribution(name, float(force) - before))
             before = float(force)
@@ -224,7 +224,7 @@ def _contributions(
 
 
 def _in_every_case(
-    workcell: Workcell,
+    model: RobustModel,
     uncertainty: Uncertainty,
     leader: int,
     motion: HeldMotion,
@@ -232,7 +232,6 @@ def _in_every_case(
 ) -> Array:
     """Compute the force (n,) [N] that holds every case of an uncertainty in motion and at rest, at
     least the planned force."""
-    model = robust_model(workcell)
     held = model.commanded(motion, uncertainty, leader, planned)
     return model.commanded(at_standstill(motion), uncertainty, leader, held)
 
@@ -253,9 +252,9 @@ def largest_commanded(
     """
     follower, box = 1 - leader, box_motion(motion)
     most = np.argsort(-planned[:, follower])[:MOST]
-    there, own = box.at(most), planned[most, follower]
-    level = _in_every_case(workcell, uncertainty, leader, there, own).max()
-    forces = np.full(2, _in_every_case(workcell, uncertainty, leader, box, level).max())
+    there, own, model = box.at(most), planned[most, follower], robust_model(workcell)
+    level = _in_every_case(model, uncertainty, leader, there, own).max()
+    forces = np.full(2, _in_every_case(model, uncertainty, leader, box, level).max())
     raised = command_model(workcell).raised(planned[most], forces[follower] - own, leader)
     forces[leader] = raised[:, leader].max()
     return forces

@@ -20,6 +20,7 @@ after some times is slowed down.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -28,7 +29,6 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
-from hybrid_opt.carry import Carry
 from hybrid_opt.timing.limits import LINEARISED_ABOVE, PathLimits, squared_speed_limit
 from hybrid_opt.timing.model import PathMotion, TimingModel
 from hybrid_opt.timing.records import (
@@ -147,7 +147,7 @@ class _JerkProblem:
                 break
             keep = self._coarse.keep / np.where(excess > 1.0, excess, 1.0)
             self._coarse = replace(self._coarse, keep=keep)
-            c, more = self._iterate(self._feasible_speed_factor(c) ** 2 * c)
+            c, more = self._iterate(largest_speed_factor(self._use_by_factor(c)) ** 2 * c)
             rounds += more
         return replace(self._checked_timing(c), rounds=rounds)
 
@@ -235,7 +235,7 @@ class _JerkProblem:
     def _excess(self, c: Array) -> Array:
         """Return for each coarse point the largest utilisation (n,) of any limit at the finer
         points next to it."""
-        carry = self._carry(self._fine, c)
+        carry = self._model.carry(self._fine.motion, *self._fine.profile(c))
         ratios = self._model.carry_limits.ratios(carry, self._limits)
         del ratios[FRICTION_RATIO]
         joint, box = self._jerks(self._fine, c)
@@ -247,14 +247,11 @@ class _JerkProblem:
         """Return a factor on the squared speeds of coefficients c at which all limits are little
         used."""
         factor = 1.0
-        rest = self._most_used(self._coarse, 0.0 * c)
+        rest = max(self._check(self._coarse, 0.0 * c)[1:])
         allowed = rest + START_UTILISATION * (1.0 - rest)
-        while self._most_used(self._coarse, factor * c) > allowed:
+        while max(self._check(self._coarse, factor * c)[1:]) > allowed:
             factor *= 0.5
         return factor
-
-    def _carry(self, at: WarpedPath, c: Array) -> Carry:
-        return self._model.carry(at.motion, at.time(c), at.speed(c), at.acceleration(c))
 
     def _jerks(self, at: WarpedPath, c: Array) -> tuple[Array, Array]:
         """Return at each point (n,) the largest joint jerk over its limit, and the payload jerk
@@ -264,30 +261,27 @@ class _JerkProblem:
         return stack_joint_limits, np.linalg.norm(box, axis=1) / self._jerk.payload
 
     def _check(self, at: WarpedPath, c: Array) -> tuple[Timing, float, float, float]:
-        timing = check_limits(self._model, self._carry(at, c), self._limits)
+        carry = self._model.carry(at.motion, *at.profile(c))
+        timing = check_limits(self._model, carry, self._limits)
         joint, box = (float(jerk.max()) for jerk in self._jerks(at, c))
         return timing, most_used(timing.use).ratio, joint, box
 
-    def _most_used(self, at: WarpedPath, c: Array) -> float:
-        return max(self._check(at, c)[1:])
-
-    def _feasible_speed_factor(self, c: Array) -> float:
-        """Return the largest factor on the speeds, at most one, with which the timing satisfies all
-        limits on the finer grid."""
+    def _use_by_factor(self, c: Array) -> Callable[[float], float]:
+        """Return the function of a factor on the speeds to the largest utilisation of a limit on
+        the finer grid."""
         jerk = max(float(jerk.max()) for jerk in self._jerks(self._fine, c))
 
         def use(f: float) -> float:
-            carry = self._carry(self._fine, f**2 * c)
-            return max(
-                most_used(check_limits(self._model, carry, self._limits).use).ratio, f**3 * jerk
-            )
+            carry = self._model.carry(self._fine.motion, *self._fine.profile(f**2 * c))
+            timing = check_limits(self._model, carry, self._limits)
+            return max(most_used(timing.use).ratio, f**3 * jerk)
 
-        return largest_speed_factor(use)
+        return use
 
     def _checked_timing(self, c: Array) -> JerkTiming:
         """Check the timing of coefficients c on the finer grid, and slow it down if it exceeds a
         limit."""
-        factor = self._feasible_speed_factor(c)
+        factor = largest_speed_factor(self._use_by_factor(c))
         timing, *uses = self._check(self._fine, factor**2 * c)
         status = TimingStatus.OK if factor >= LEAST_SPEED_FACTOR else TimingStatus.NOT_CONVERGED
         place = timing.place
@@ -383,23 +377,15 @@ class WarpedPath:
         weights[[0, -1]] = 1.0
         return weights / (3.0 * (len(self.s) - 1))
 
-    def time(self, c: Array) -> Array:
-        """Return the times (n,) of the samples [s]; s itself if all coefficients are zero
-        (rest)."""
-        v = self.value @ c
-        if not v.any():
-            return self.s
-        slowness = 1.0 / np.sqrt(v)
-        steps = np.diff(self.s) * (slowness[1:] + slowness[:-1]) / 2.0
-        return np.concatenate([[0.0], np.cumsum(steps)])
-
-    def speed(self, c: Array) -> Array:
-        """Return the path speeds u' (n,) [1/s]."""
-        return np.sqrt(np.maximum(self.squared_by @ c, 0.0))
-
-    def acceleration(self, c: Array) -> Array:
-        """Return the path accelerations u'' (n,) [1/s^2]."""
-        return np.asarray(self.acceleration_by @ c)
+    def profile(self, c: Array) -> tuple[Array, Array, Array]:
+        """Return the times [s] of the samples, their path speeds u' [1/s] and accelerations u''
+        [1/s^2], each (n,). The times are s itself if all coefficients are zero (rest)."""
+        v, time = self.value @ c, self.s
+        if v.any():
+            slowness = 1.0 / np.sqrt(v)
+            steps = np.diff(self.s) * (slowness[1:] + slowness[:-1]) / 2.0
+            time = np.concatenate([[0.0], np.cumsum(steps)])
+        return time, np.sqrt(np.maximum(self.squared_by @ c, 0.0)), self.acceleration_by @ c
 
     def jerk(self, c: Array) -> tuple[Array, Array]:
         """Return the jerks of the joints (n, joints) [rad/s^3] and of the box frame (n, 3)

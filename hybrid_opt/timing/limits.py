@@ -13,6 +13,9 @@ from symbolic.array import Array
 from symbolic.contact.registry import command_model
 from symbolic.limits import Limit, limits_of_block
 
+SPEEDS, PAYLOAD_ACCELERATIONS = limits_of_block("speed"), limits_of_block("cone")
+(JOINT_ACCELERATION,) = limits_of_block("acceleration")
+
 LINEARISED_ABOVE = 0.6
 """Joint torques and pressure shifts below this share of their limits are left out of programs."""
 
@@ -37,9 +40,8 @@ class PathLimits:
     def joint_accelerations(self) -> tuple[Array, Array]:
         """Return the derivatives (n, all joints) of the joint accelerations by u'' and by u'^2,
         over the limits. The limits apply to both signs."""
-        (limit,) = limits_of_block("acceleration")
-        first, second = self._derivatives(limit)
-        bound = self._bounds[limit.name]
+        first, second = self._derivatives(JOINT_ACCELERATION)
+        bound = self._bounds[JOINT_ACCELERATION.name]
         return first / bound, second / bound
 
     def accelerations(self) -> list[tuple[Array, Array, float]]:
@@ -47,7 +49,7 @@ class PathLimits:
         u'^2, and the bound on its length."""
         return [
             (first[:, :3], second[:, :3], float(self._bounds[limit.name]))
-            for limit in limits_of_block("cone")
+            for limit in PAYLOAD_ACCELERATIONS
             for first, second in [self._derivatives(limit)]
         ]
 
@@ -114,7 +116,7 @@ def squared_speed_limit(model: TimingModel, motion: PathMotion, limits: TimingLi
     moves."""
     task, bounds = model.workcell.task, model.carry_limits.bounds
     demands = []
-    for limit in limits_of_block("speed"):
+    for limit in SPEEDS:
         if limit.path:
             values = getattr(motion, f"{limit.path}_first")
             values = np.abs(values) if limit.scope == "joint" else row_lengths(values[:, :3])

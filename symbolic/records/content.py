@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Hashable, Iterable
+from collections.abc import Hashable
 from dataclasses import fields
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
@@ -15,35 +15,32 @@ import numpy as np
 
 def digest_of_parts(value: Any, folder: Path = Path()) -> str:
     """Compute the SHA-256 of a record's content, part by part. Paths count relative to `folder`."""
-    found: list[bytes] = []
-
-    def add(values: Iterable[Any]) -> None:
-        for value in values:
-            kind = _kind(value.__class__)
-            if kind == "plain":
-                found.append(_of_plain(value))
-            elif kind == "tuple":
-                found.append(_tuple_head(len(value)))
-                add(value)
-            elif kind == "array":
-                found.append(_array_head(value.dtype, value.shape))
-                found.append(_counted(value.tobytes()))
-            elif kind == "content":
-                found.append(_counted(value.content.encode()))
-            elif kind == "record":
-                head, names = _record(value.__class__)
-                found.append(head)
-                add([getattr(value, name) for name in names])
-            elif kind == "type":
-                found.append(_counted(value.__name__.encode()))
-            elif kind == "path":
-                text = os.path.relpath(value, folder)
-                found.append(_counted(text.encode(errors="surrogateescape")))
-            else:
-                # Numbers come back from their representation to the bit.
-                found.append(_of_value(value))
-
-    add((value,))
+    found, left = list[bytes](), [value]
+    while left:
+        part = left.pop()
+        kind = _kind(part.__class__)
+        if kind == "plain":
+            found.append(_of_plain(part))
+        elif kind == "tuple":
+            found.append(_tuple_head(len(part)))
+            left += reversed(part)
+        elif kind == "array":
+            found.append(_array_head(part.dtype, part.shape))
+            found.append(_counted(part.tobytes()))
+        elif kind == "content":
+            found.append(_counted(part.content.encode()))
+        elif kind == "record":
+            head, names = _record(part.__class__)
+            found.append(head)
+            left += [getattr(part, name) for name in reversed(names)]
+        elif kind == "type":
+            found.append(_counted(part.__name__.encode()))
+        elif kind == "path":
+            text = os.path.relpath(part, folder)
+            found.append(_counted(text.encode(errors="surrogateescape")))
+        else:
+            # Numbers come back from their representation to the bit.
+            found.append(_of_value(part))
     return hashlib.sha256(b"".join(found)).hexdigest()
 
 

@@ -20,6 +20,7 @@ from hybrid_opt.sensitivity import Sensitivity
 from hybrid_opt.timing.solve import drive_path
 from symbolic import safe_io
 from symbolic.array import Array
+from symbolic.contact.registry import command_model
 from symbolic.contact.worst_cases import case_gradient_function, case_squeeze_function
 from symbolic.errors import SettingsError, WorkcellError
 from tests.hybrid_opt.cells import drivable, shipped
@@ -190,7 +191,7 @@ def test_slopes_of_what_pads_anywhere_need() -> None:
     least = case_squeeze_function(workcell, 1)
     at = np.random.default_rng(1).normal(scale=0.1, size=18)
     at[2] += 0.8
-    case = worst_cases(workcell, workcell.uncertainty)[7]
+    case = worst_cases(command_model(workcell), workcell.uncertainty)[7]
     case[1] *= 0.9  # of equal frictions both decide
 
     def force(values: Array) -> Array:

@@ -25,6 +25,7 @@ from hybrid_opt.robust.force import (
 )
 from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, RobustPath
 from symbolic.array import Array
+from symbolic.contact.registry import command_model
 from symbolic.contact.worst_cases import CASE_SIZES, case_squeeze_function
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load
@@ -169,7 +170,7 @@ def test_cases_within_the_ranges_lie_below_the_vertices() -> None:
 def test_leading_arm_feels_no_more_than_told() -> None:
     """In every case the leader's force is the commanded one and the motion's difference."""
     force = model().robust_force(motion())
-    rng, worst = np.random.default_rng(5), worst_cases(model().workcell, SET)
+    rng, worst = np.random.default_rng(5), worst_cases(command_model(model().workcell), SET)
     cases = worst[rng.integers(len(worst), size=200)]
     cases[:, 4] = 10.0 * rng.uniform(0.95, 1.05, 200)
     needed = model().least_squeeze(motion(), cases)
