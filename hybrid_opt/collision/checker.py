@@ -90,14 +90,13 @@ class CollisionChecker:
         self._place = functions["piece_poses"].batch
         self.free_beyond = geometry.tolerance + FCL_RESOLUTION
         self._pairs = np.array([(p.first, p.second) for p in geometry.active]).reshape(-1, 2)
-        self._names = geometry.pair_names
+        self._names, self._parts = geometry.pair_names, (6, 6 + geometry.arms[0].joints)
         self.resting_places = self._find_resting()
 
     def split(self, configuration: Array) -> tuple[Array, Array, Array]:
         """Split configurations (n, 6 + all joints) into box poses (n, 6) and both arms' joints
         (n, joints), each contiguous."""
-        at = 6 + self.geometry.arms[0].joints
-        parts = (configuration[:, :6], configuration[:, 6:at], configuration[:, at:])
+        parts = np.split(configuration, self._parts, axis=1)
         first, second, third = map(np.ascontiguousarray, parts)
         return first, second, third
 

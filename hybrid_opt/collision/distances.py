@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cache
-from importlib import import_module
 from typing import Any
 
 import coal  # loads the library that the compiled module needs
@@ -23,12 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symbolic.array import Array
-from symbolic.errors import BridgeError
 from symbolic.geometry.bodies import BOX, CollisionBody
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.geometry.pieces import ConvexShape, Hull, Piece, shrunk
 from symbolic.records import PAYLOAD_NAME, Box, Capsule, Cylinder, Sphere
-from symbolic.robot.bridge import REMEDY, require_same_minor
+from symbolic.robot.bridge import compiled_module, require_same_minor
 
 INTERSECTING, OPEN, APART = -1, 0, 1
 """Verdicts of `BodyDistances.decide`: proven to intersect, not proven, proven to be apart."""
@@ -44,12 +42,8 @@ def compiled_distances() -> Any:
     Raises:
         BridgeError: the module is missing, cannot be loaded, or was compiled against another Coal.
     """
-    try:
-        found = import_module("hybrid_opt.collision._distances")
-    except ImportError as error:
-        raise BridgeError(
-            f"the compiled part of collision checking cannot be loaded ({error}); {REMEDY}"
-        ) from error
+    name = "hybrid_opt.collision._distances"
+    found = compiled_module(name, "the compiled part of collision checking")
     require_same_minor({"coal": found.COAL_VERSION}, {"coal": coal.__version__})
     return found
 
@@ -107,7 +101,8 @@ class BodyDistances:
             Lower and upper bounds (m,) [m]. Both are negative if the bodies intersect, and -inf and
             inf at a pose that is not finite.
         """
-        lower, upper = self.native.distances(*_poses(placed), rows, first, second)
+        at = placed["quaternions"], placed["positions"]
+        lower, upper = self.native.distances(*at, rows, first, second)
         return lower, upper
 
     def decide(
@@ -130,14 +125,9 @@ class BodyDistances:
         Returns:
             (m,) `APART`, `INTERSECTING`, or `OPEN` if neither is proven.
         """
-        found: NDArray[np.int8] = self.native.decide(
-            *_poses(placed), rows, first, second, apart, overlap
-        )
+        at = placed["quaternions"], placed["positions"]
+        found: NDArray[np.int8] = self.native.decide(*at, rows, first, second, apart, overlap)
         return found
-
-
-def _poses(placed: Mapping[str, Array]) -> tuple[Array, Array]:
-    return placed["quaternions"], placed["positions"]
 
 
 def shape_table(

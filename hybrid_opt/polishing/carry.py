@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache, partial
+from functools import lru_cache, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,7 @@ from numpy.typing import NDArray
 from hybrid_opt.polishing.cell import SmoothCell
 from symbolic.array import Array
 from symbolic.contact.registry import contact_model
-from symbolic.records.task import POSE_SIZE, extended_waypoints, place_redundant
+from symbolic.records.task import POSE_SIZE, place_redundant
 from symbolic.robot.arm import REACH_TOLERANCE
 from symbolic.smooth.places import ManipulabilityLimit
 
@@ -35,6 +36,7 @@ class PlacedCarry:
     """A candidate at m places.
 
     Attributes:
+        waypoints: (n_waypoints, 6 + m) extended waypoints [m, rad].
         pose, rate: (m, 6) box poses [m, rad], and their first derivative by the path parameter.
         q: joint positions of both arms, (m, n) each [rad]; undefined from `reached` on.
         reached: places before the first one out of an arm's reach.
@@ -51,6 +53,7 @@ class PlacedCarry:
         gaps: function of a separable pair to its gaps (reached, SEPARATING_DIRECTIONS) [m].
     """
 
+    waypoints: Array
     pose: Array
     rate: Array
     q: tuple[Array, Array]
@@ -118,38 +121,21 @@ class Distances:
     """
 
     def __init__(
-        self,
-        find: Callable[[], Array],
-        measure: Callable[[NDArray[np.intp], Array, NDArray[np.bool_]], object],
+        self, bounds: Array, measure: Callable[..., object], configuration: Sequence[NDArray[Any]]
     ) -> None:
-        """Prepare without any evaluation.
+        """Interpolate the minima.
 
         Args:
-            find: returns the bounds.
-            measure: raises the bounds (k, n_pairs) of some places (k,) to distances where wanted.
+            bounds: (n, n_pairs) lower bounds [m].
+            measure: raises bounds in place; see `CollisionChecker.measure`.
+            configuration: arrays (n, ...) of the n places, the first arguments of `measure`.
         """
-        self._find, self._measure = find, measure
-
-    @cached_property
-    def bounds(self) -> Array:
-        """Return lower bounds (n, n_pairs) [m]."""
-        return self._find()
-
-    @cached_property
-    def interpolated_clearance(self) -> Array:
-        """Return lower bounds (n, n_pairs) with interpolated minima [m]."""
-        near = self.bounds.min(axis=0, initial=np.inf) < MINIMA_BELOW
-        interpolated_clearance = self.bounds.copy()
-        interpolated_clearance[:, near] = interpolate_minima(self.bounds[:, near])
-        return interpolated_clearance
-
-    @cached_property
-    def _values(self) -> Array:
-        return self.interpolated_clearance.copy()
-
-    @cached_property
-    def _unmeasured(self) -> NDArray[np.bool_]:
-        return np.ones(self.bounds.shape, dtype=np.bool_)
+        near = bounds.min(axis=0, initial=np.inf) < MINIMA_BELOW
+        self.bounds, self.interpolated_clearance = bounds, bounds.copy()
+        self.interpolated_clearance[:, near] = interpolate_minima(bounds[:, near])
+        self._measure, self._configuration = measure, configuration
+        self._values = self.interpolated_clearance.copy()
+        self._unmeasured = np.ones(bounds.shape, dtype=np.bool_)
 
     def at(self, wanted: NDArray[np.bool_]) -> Array:
         """Return distances (n, n_pairs) [m]: measured by FCL where wanted, else
@@ -164,7 +150,7 @@ class Distances:
         wanted = np.zeros((len(rows), self.bounds.shape[1]), dtype=np.bool_)
         wanted[local, pairs] = True
         raised = self.bounds[rows]
-        self._measure(rows, raised, wanted)
+        self._measure(*(part[rows] for part in self._configuration), raised, wanted)
         self._values[places, pairs] += raised[local, pairs] - self.bounds[places, pairs]
         self._unmeasured[places, pairs] = False
 
@@ -208,8 +194,10 @@ class CarryReader:
     """Evaluates candidates of one cell at places along the path."""
 
     def __init__(self, cell: SmoothCell) -> None:
-        self._evaluator, self._grid, self._robust = cell.evaluator, cell.grid, cell.robust
-        self._functions = cell.functions
+        self._cell = cell
+        self._manipulability = [
+            cell.functions.row(ManipulabilityLimit(arm), "first") for arm in (0, 1)
+        ]
         self._radii = [contact.patch_radius for contact in cell.workcell.contacts]
         # Drivable carries have no rows of forces at samples.
         self._split_of = (
@@ -218,14 +206,14 @@ class CarryReader:
 
     def read(self, x: Array) -> PlacedCarry:
         """Evaluate a decision vector (n_var,)."""
-        evaluator, grid = self._evaluator, self._grid
+        cell, evaluator, grid = self._cell, self._cell.evaluator, self._cell.grid
         found = {name: value[0] for name, value in evaluator.outputs(x[None]).items()}
-        task = evaluator.workcell.task
-        waypoints = extended_waypoints(task, x)
+        waypoints = cell.waypoints(x)
         extended = grid.basis @ waypoints
         pose = np.ascontiguousarray(extended[:, :POSE_SIZE])
         guesses = [grid.between(found[f"q_{arm}"]) for arm in (1, 2)]
-        place_redundant(task, extended, guesses)
+        if cell.task.redundant:
+            place_redundant(cell.task, extended, guesses)
         posture = evaluator.functions["posture"].batch(pose, *guesses)
         followed = np.column_stack(
             [
@@ -239,17 +227,19 @@ class CarryReader:
         q_1, q_2 = posture["q_1"], posture["q_2"]
         rate = np.ascontiguousarray((grid.rate_basis @ waypoints)[:, :POSE_SIZE])
         squares = [
-            1.0
-            + self._functions.row(ManipulabilityLimit(arm), "first").batch(pose, rate, q_1, q_2)[
-                "value"
-            ]
-            for arm in (0, 1)
+            1.0 + function.batch(pose, rate, q_1, q_2)["value"] for function in self._manipulability
         ]
         force = found["normal_force"]
-        minimised = force if self._robust is None else self._robust.forces(found)
+        minimised = force if cell.robust is None else cell.robust.forces(found)
         held = pose[:reached], q_1[:reached], q_2[:reached]
-        gaps = lru_cache(maxsize=None)(partial(self._functions.gaps, pose=held[0]))
+        gaps = lru_cache(maxsize=None)(partial(cell.functions.gaps, pose=held[0]))
+        bounds = evaluator.checker.bounds(*held)
+        # Those of the payload from a box are raised to the largest gap.
+        near = bounds.min(axis=0, initial=np.inf) < SEPARATING_AXES_BELOW
+        for pair in cell.functions.separable.intersection(np.flatnonzero(near).tolist()):
+            np.maximum(bounds[:, pair], gaps(pair).max(axis=1), out=bounds[:, pair])
         return PlacedCarry(
+            waypoints=waypoints,
             pose=pose,
             rate=rate,
             q=(q_1, q_2),
@@ -258,20 +248,8 @@ class CarryReader:
             manipulability=np.sqrt(np.maximum(np.column_stack(squares), 0.0))[:reached],
             split=force if self._split_of is None else self._split_of(found),
             force=minimised,
-            peak=minimised.max(axis=0) / task.reference_force,
+            peak=minimised.max(axis=0) / cell.task.reference_force,
             shift=found["pressure_shift"] / self._radii,
-            distances=Distances(
-                lambda: self._raised_by_gaps(evaluator.checker.bounds(*held), gaps),
-                lambda rows, raised, wanted: evaluator.checker.measure(
-                    held[0][rows], held[1][rows], held[2][rows], raised, wanted
-                ),
-            ),
+            distances=Distances(bounds, evaluator.checker.measure, held),
             gaps=gaps,
         )
-
-    def _raised_by_gaps(self, bounds: Array, gaps: Callable[[int], Array]) -> Array:
-        """Raise bounds (n, n_pairs) of the payload from a box to the largest gap."""
-        near = bounds.min(axis=0, initial=np.inf) < SEPARATING_AXES_BELOW
-        for pair in self._functions.separable.intersection(np.flatnonzero(near).tolist()):
-            np.maximum(bounds[:, pair], gaps(pair).max(axis=1), out=bounds[:, pair])
-        return bounds

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache, lru_cache
+from functools import cache
 
 import casadi as ca
 import numpy as np
@@ -75,6 +75,12 @@ class PolishFunctions:
         built: by name; see `symbolic.smooth`: forces and pressure at samples, inverse kinematics of
             both arms, in drivable cells limits along a driven path; rows at places of
             the path, missing ones compiled on first use.
+        closure: function of an arm and an order to the arm's joints as a function of the box pose;
+            see `symbolic.smooth.places`.
+        row: function of a constraint and an order to its family's row function; see
+            `symbolic.smooth.places.row_function`.
+        numbers, arms: functions of a constraint to its parameters, and to the arms on whose joints
+            its value depends.
         model: arms and bodies of the cell.
         separable: pairs with known gaps; see `gaps`.
     """
@@ -82,16 +88,16 @@ class PolishFunctions:
     def __init__(self, compiled: CompiledCell, built: Mapping[str, NumericFunction]) -> None:
         self.model, self.built, self._cell = compiled.bodies, dict(built), compiled
         self._place, self._symbols = PathPointSymbols(self.model), cache(PathPointSymbols)
-        self.numbers = lru_cache(maxsize=None)(self._numbers)
-        self._obstacle = lru_cache(maxsize=None)(self._place.obstacle)
+        # Every iteration asks for all of its rows.
+        self.row, self.closure = cache(self._row), cache(self._closure)
+        self.numbers, self.arms = cache(self._numbers), cache(self._arms)
+        self._obstacle = cache(self._place.obstacle)
         self.separable = frozenset(self._place.separable())
 
-    def closure(self, arm: int, order: Order) -> NumericFunction:
-        """Return an arm's joints as a function of the box pose; see `symbolic.smooth.places`."""
+    def _closure(self, arm: int, order: Order) -> NumericFunction:
         return self.built[closure_name(arm, order)]
 
-    def row(self, constraint: PathConstraint, order: Order) -> NumericFunction:
-        """Return a family's row function; see `symbolic.smooth.places.row_function`."""
+    def _row(self, constraint: PathConstraint, order: Order) -> NumericFunction:
         name = row_name(constraint.family, order)
         if name not in self.built:
 
@@ -104,6 +110,9 @@ class PolishFunctions:
 
     def _numbers(self, constraint: PathConstraint) -> Array:
         return constraint.numbers(self._place)
+
+    def _arms(self, constraint: PathConstraint) -> tuple[int, ...]:
+        return constraint.arms(self.model)
 
     def gaps(self, pair: int, pose: Array) -> Array:
         """Evaluate the gaps (n, SEPARATING_DIRECTIONS) [m] of a separable pair at box poses (n,
@@ -256,7 +265,6 @@ class SmoothCell:
         blocks: division of the samples among functions.
         coefficients: (2, branches, 2) of `force_branches`.
         has_pressure_limit: whether the contact model limits the shift of the pressure.
-        still: (n_waypoints, 6 + m) extended waypoints without the variables.
     """
 
     def __init__(
@@ -285,9 +293,7 @@ class SmoothCell:
         self.coefficients = model.force_branches
         self.has_pressure_limit = model.has_pressure_limit
         self.free = self.task.free_entries
-        self._n_path = self.task.n_path
-        fixed = [waypoint.lower for waypoint in self.task.waypoints]
-        self.still = np.column_stack([fixed, *[joint.lower for joint in self.task.redundant]])
+        self._n_path, self._fixed = self.task.n_path, self.task.fixed_waypoints
 
     def scaled(self, x: Array) -> Array:
         """Return scaled variables xi of x."""
@@ -304,7 +310,7 @@ class SmoothCell:
     def waypoints(self, x: Array) -> Array:
         """Return `extended_waypoints`, from stored data and without unwrapping where no angle
         wraps."""
-        points = self.still.copy()
+        points = self._fixed.copy()
         points[self.free] = x[: self._n_path]
         turns = points[1:, 3:POSE_SIZE] - points[:-1, 3:POSE_SIZE]
         return extended_waypoints(self.task, x) if np.abs(turns).max() > np.pi else points

@@ -44,14 +44,13 @@ from hybrid_opt.polishing.solvers.quadratic import (
     solve_quadratic,
 )
 from hybrid_opt.robust.path_force import PathPoints, robust_path
-from hybrid_opt.timing.path_timer import CandidateDriver
-from hybrid_opt.timing.records import PathTiming
+from hybrid_opt.timing.path_timer import CandidateDriver, TimedCandidate
 from symbolic.array import Array
 from symbolic.contact.registry import command_model
 from symbolic.errors import SettingsError
 from symbolic.path.pieces import coarse_entries, hierarchical_basis
 from symbolic.records import Workcell
-from symbolic.records.task import waypoints_of
+from symbolic.records.task import initial_decision, waypoints_of
 
 FIRST_DRIVE_RADIUS, LEAST_DRIVE_RADIUS = 0.3, 1e-4
 """Radii of the trust region [half ranges of the waypoints]: the first, and the one below which a
@@ -105,54 +104,6 @@ def is_polishable(workcell: Workcell, robust: bool) -> bool:
     """Return True if drivable carries of a cell can be polished: if robust forces are limited, it
     needs two pads with opposite normals."""
     return command_model(workcell).has_scalar_squeeze or not robust
-
-
-@dataclass(frozen=True)
-class EvaluatedPath:
-    """A path with its fastest timing within a force limit.
-
-    Attributes:
-        duration: [s], infinite without a timing.
-        squared: (intervals + 1,) u'^2 at the grid points.
-        joints: of both arms at the grid points (intervals + 1, n) [rad].
-    """
-
-    duration: float
-    squared: Array
-    joints: tuple[Array, Array]
-
-
-class PathEvaluator:
-    """Times paths by the compiled passes.
-
-    Attributes:
-        force_limit: least and largest [N].
-    """
-
-    def __init__(self, driver: CandidateDriver) -> None:
-        self._driver, self.force_limit = driver, force_range(driver)
-
-    def fastest_timing(self, x: Array) -> EvaluatedPath:
-        """Compute the fastest timing of a decision vector (n_var,)."""
-        found, known = self._driver.time_candidate(x)
-        duration = found.duration if found.ok else float("inf")
-        joints = [np.ascontiguousarray(known[f"q_{arm}"][0][::2]) for arm in (1, 2)]
-        return EvaluatedPath(duration, found.grid_speed**2, (joints[0], joints[1]))
-
-    def durations(self, paths: Array, force: float) -> Array:
-        """Compute durations (n,) [s] of paths (n, n_path) within a force limit [N], infinite
-        without a timing."""
-        found = self._timings(paths, force)
-        return np.array([t.duration if t.ok else np.inf for t in found])
-
-    def at_rest(self, paths: Array) -> Array:
-        """Compute the forces (n,) [N] that paths (n, n_path) need at rest, NaN if the arms cannot
-        follow."""
-        return np.array([timing.limited_force for timing in self._timings(paths, 0.0)])
-
-    def _timings(self, paths: Array, force: float) -> list[PathTiming]:
-        limits = [self._driver.limits(force)] * len(paths)
-        return self._driver.timer.time_all(np.ascontiguousarray(paths), limits)
 
 
 def force_range(driver: CandidateDriver) -> tuple[float, float]:
@@ -211,7 +162,9 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
     """Minimise the duration within the force limit of the start. A resource: one per process.
 
     Attributes:
-        driver, paths: timings of carries and paths.
+        driver: times candidates and paths.
+        force_limit: least and largest force limit [N].
+        hand_made: (n_path,) path of the hand-made trajectory.
         coarse: the same method in the waypoints of the file, which the intermediate ones follow;
             itself without intermediate ones. Fewer variables need fewer and cheaper iterations.
     """
@@ -245,7 +198,8 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         self._unit = (self.half * square)[own]
         self._newton = NEWTON_STEP * float(square[own].min())
         self._spread = by[:, own] * self._unit
-        self.paths = PathEvaluator(driver)
+        self.force_limit = force_range(driver)
+        self.hand_made = initial_decision(task)[: task.n_path]
         intervals, threads = driver.timer.intervals, cell.evaluator.threads
         self._intervals = IntervalGrid(
             cell.workcell, intervals, self._spread, driver.robust, threads
@@ -256,11 +210,11 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
 
     def evaluate(self, x: Array) -> DriveIterate:
         """Evaluate a candidate and its fastest timing."""
-        timed = self.paths.fastest_timing(x)
+        timed = self.driver.time_candidate(x)
         return self._iterate(x, timed, timed.squared, np.inf)
 
     def _iterate(
-        self, x: Array, timed: EvaluatedPath, squared: Array, best_level: float
+        self, x: Array, timed: TimedCandidate, squared: Array, best_level: float
     ) -> DriveIterate:
         best_level = min(best_level, timed.duration)
         return DriveIterate(
@@ -279,7 +233,7 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         tiny = step.gain <= TIMING_NOISE
         for fraction in DRIVE_BACKTRACKING:
             x = self._moved(best.x, fraction * step.d)
-            timed = self.paths.fastest_timing(x)
+            timed = self.driver.time_candidate(x)
             gain = 1.0 - timed.duration / best.level
             is_no_worse = timed.duration <= best.best_level * (1.0 + TIMING_NOISE)
             if gain >= LEAST_REDUCTION_RATIO * fraction * step.gain or (tiny and is_no_worse):
@@ -305,7 +259,7 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
     ) -> DriveIterate | None:
         """Evaluate a fraction of a step; see `StepMethod`."""
         x = self._moved(begin.x, share * step.d)
-        timed = self.paths.fastest_timing(x)
+        timed = self.driver.time_candidate(x)
         if timed.duration >= best.level * (1.0 - TIMING_NOISE):
             return None
         return self._iterate(x, timed, timed.squared, best.best_level)
@@ -315,7 +269,9 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
     ) -> DriveStep | None:
         """Solve the quadratic model of path and timing about the best iterate."""
         grid = self._intervals
-        values = IntervalValues(grid, self.cell.functions, best.x, best.squared, best.joints)
+        values = IntervalValues(
+            grid, self.cell.functions, best.carry.waypoints, best.squared, best.joints
+        )
         program = PathTimingProgram(
             grid, values, best.x, best.squared, self.cell, required, best.carry
         )

@@ -9,7 +9,7 @@ between their neighbours, which are timed but not improved.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from math import ceil
 from typing import Literal
@@ -17,9 +17,9 @@ from typing import Literal
 import numpy as np
 
 from hybrid_opt.polishing.drive import REST_FORCE_MARGIN, DriveStepMethod
-from hybrid_opt.polishing.front import LEAST_SPAN, Attempt, FailedAttempt, ParetoArchive, PolishRun
+from hybrid_opt.polishing.front import LEAST_SPAN, Attempt, ParetoArchive, PolishRun
 from hybrid_opt.polishing.point import Solution
-from hybrid_opt.polishing.records import PolishOutcome, Status
+from hybrid_opt.polishing.records import Status
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.starts import rotated_starts
 from hybrid_opt.timing.model import TimingModel
@@ -27,7 +27,6 @@ from hybrid_opt.timing.path_timer import CandidateDriver
 from hybrid_opt.timing.solve import drive_path
 from symbolic.array import Array
 from symbolic.path.pieces import coarse_task, resample_decisions
-from symbolic.records.task import initial_decision
 
 LEAST_GAP = 0.02
 """Narrower gaps are left [front's extent]."""
@@ -92,7 +91,7 @@ def recheck_timing(driver: CandidateDriver, model: TimingModel, x: Array) -> str
     Args:
         model: of the driver's workcell and intervals.
     """
-    timing, _ = driver.time_candidate(np.asarray(x))
+    timing = driver.time_candidate(np.asarray(x)).timing
     if not timing.ok:
         return f"no timing: {timing.status}"
     limits = driver.limits(float(x[-1]))
@@ -107,7 +106,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         self,
         drive_method: DriveStepMethod,
         settings: PolishSettings,
-        recheck: Callable[[Array], str],
+        timings: TimingModel,
         archive: ParetoArchive,
         on_progress: Callable[[int, int], None],
         paths: Array,
@@ -115,21 +114,21 @@ class DriveRun(PolishRun[DriveAttempt]):
         """Collect the known paths.
 
         Args:
-            recheck: returns why a decision vector's timing fails on the finer grid; see
-                `recheck_timing`.
+            timings: recomputes timings on the finer grid; see `recheck_timing`.
             paths: (m, n_path) known paths that are not on the front.
         """
         super().__init__(drive_method.cell.evaluator, settings, archive, on_progress)
         self._most_attempts = MOST_DRIVE_ATTEMPTS
-        self._method, self._recheck, task = drive_method, recheck, drive_method.cell.task
-        self._n_path, self._range = task.n_path, drive_method.paths.force_limit
+        self._method, self._timings, task = drive_method, timings, drive_method.cell.task
+        self._n_path, self._range = task.n_path, drive_method.force_limit
         self._reference = float(task.reference_force.min())
         self._by_force = 1 - self._evaluator.objective_names.index("duration")
         self._tried: set[float] = set()
-        self._hand_made = initial_decision(task)[: self._n_path]
+        self._hand_made, self._driver = drive_method.hand_made, drive_method.driver
         self._paths, self._others, self._largest = paths, paths[:0], self._range[0]
         known = [x[: self._n_path] for x in archive.x]
-        rest = drive_method.paths.at_rest(np.vstack([*known, self._hand_made, paths]))
+        every = np.vstack([*known, self._hand_made, paths])
+        rest = [t.limited_force for t in self._driver.time_paths(every, np.zeros(len(every)))]
         # No known path can be held still with less.
         least = np.nanmin(rest, initial=self._range[1])
         self._least = min(
@@ -137,7 +136,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         )
         self._still = self._least / (1.0 + REST_FORCE_MARGIN)
 
-    def run(self, rng: np.random.Generator) -> None:
+    def attempts(self, rng: np.random.Generator) -> Iterator[DriveAttempt]:
         """Polish one path by the waypoints of the file, sweep the force limits with all, then fill
         gaps."""
         forces = map(self._used_force, self._archive.front_indices())
@@ -149,13 +148,13 @@ class DriveRun(PolishRun[DriveAttempt]):
         ahead = len(limits) + FRONT_ENDS + self._settings.drivable.members
         self._announce(1 + ahead)
         paths, durations = self._known_paths(limits[0])
-        self._attempt(paths[int(np.argmin(durations))], limits[0], "stated")
+        yield self._attempt(paths[int(np.argmin(durations))], limits[0], "stated")
         if self._method.cell.has_pressure_limit:
             middle = self._intermediate_force(limits[0], fast)
             turned_paths = self._rotated(middle)
             self._announce(len(turned_paths) + ahead)
             for path in turned_paths:
-                self._attempt(path, middle, "stated")
+                yield self._attempt(path, middle, "stated")
         task, last = self._method.cell.task, list[Array]()
         for force in limits:
             paths, durations = self._known_paths(force)
@@ -163,18 +162,16 @@ class DriveRun(PolishRun[DriveAttempt]):
                 onward = last[-1] + np.outer(EXTRAPOLATED_SHARES, last[-1] - last[-2])
                 onward = np.clip(onward, task.lower[:-1], task.upper[:-1])
                 paths = np.vstack([paths, onward])
-                durations = np.append(durations, self._method.paths.durations(onward, force))
-            if self._attempt(paths[int(np.argmin(durations))], force, "all"):
+                durations = np.append(durations, self._driver.durations(onward, force))
+            yield self._attempt(paths[int(np.argmin(durations))], force, "all")
+            if self.outcomes[-1].status == "accepted":
                 last.append(self.outcomes[-1].x[: self._n_path])
-        self._fill_gaps()
+        yield from self._gaps()
 
-    def _attempt(self, path: Array, force: float, moves: Literal["stated", "all"]) -> bool:
-        """Process an attempt at a force limit from a path (n_path,); return True if it is
-        accepted."""
+    def _attempt(self, path: Array, force: float, moves: Literal["stated", "all"]) -> DriveAttempt:
+        """Return the attempt at a force limit from a path (n_path,)."""
         x = np.append(path, force)
-        start = self._evaluator.evaluate(x).objectives[0]
-        self._process([DriveAttempt("gap", -1, x, start, moves)])
-        return self.outcomes[-1].status == "accepted"
+        return DriveAttempt("gap", -1, x, self._evaluator.evaluate(x).objectives[0], moves)
 
     def _rotated(self, force: float) -> list[Array]:
         """Rotate the best known path and the hand-made one in every direction by the waypoints of
@@ -185,7 +182,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         task, own = self._method.cell.task, coarse_task(self._method.cell.task)
 
         def durations_of(turned_paths: Array) -> Array:
-            return self._method.paths.durations(resample_decisions(turned_paths, own, task), force)
+            return self._driver.durations(resample_decisions(turned_paths, own, task), force)
 
         return [
             resample_decisions(path, own, task)[0]
@@ -205,13 +202,13 @@ class DriveRun(PolishRun[DriveAttempt]):
         above = np.sqrt((first - self._still) * (second - self._still))
         return float(self._still + above)
 
-    def _fill_gaps(self) -> None:
-        """Add points of known paths at both ends of the front, then of interpolated paths in its
+    def _gaps(self) -> Iterator[DriveAttempt]:
+        """Yield points of known paths at both ends of the front, then of interpolated paths in its
         widest gaps."""
         members = self._settings.drivable.members
         for ahead, force in ((FRONT_ENDS, self._least), (FRONT_ENDS - 1, self._largest)):
             self._announce(ahead + members)
-            self._add_fastest(self._known_paths(force)[0], force)
+            yield from self._fastest(self._known_paths(force)[0], force)
         for ahead in range(members, 0, -1):
             gap = self._widest_gap()
             if gap is None:
@@ -219,12 +216,13 @@ class DriveRun(PolishRun[DriveAttempt]):
             self._announce(ahead)
             first, second = (self._archive.x[k][: self._n_path] for k in gap.ends)
             between = first + np.outer(INTERPOLATED_SHARES, second - first)
-            self._add_fastest(np.vstack([between, self._others]), gap.force)
+            yield from self._fastest(np.vstack([between, self._others]), gap.force)
 
-    def _add_fastest(self, paths: Array, force: float) -> None:
-        """Add a point of the fastest of some paths (n, n_path) within a force limit."""
+    def _fastest(self, paths: Array, force: float) -> Iterator[DriveAttempt]:
+        """Yield the fastest of some paths (n, n_path) within a force limit, until one is
+        accepted."""
         self._tried.add(force)
-        durations = self._method.paths.durations(paths, force)
+        durations = self._driver.durations(paths, force)
         for k in np.argsort(durations, kind="stable")[:MOST_PATHS_TRIED]:
             x = np.append(paths[k], force)
             found = self._evaluator.evaluate(x)
@@ -232,7 +230,7 @@ class DriveRun(PolishRun[DriveAttempt]):
                 continue
             if self._archive.dominates(found.objectives[0]):
                 break
-            self._process([DriveAttempt("gap", -1, x, found.objectives[0], "none")])
+            yield DriveAttempt("gap", -1, x, found.objectives[0], "none")
             if self.outcomes[-1].status == "accepted":
                 break
 
@@ -244,7 +242,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         if not len(paths):
             return paths
         limits = self._limits(self._least, self._largest, COMPARED_LIMITS)
-        durations = [self._method.paths.durations(paths, force) for force in limits]
+        durations = [self._driver.durations(paths, force) for force in limits]
         return np.asarray(paths[np.unique(np.argmin(durations, axis=1))])
 
     def _limits(self, least: float, fast: float, count: int) -> list[float]:
@@ -262,7 +260,7 @@ class DriveRun(PolishRun[DriveAttempt]):
         """Return known paths (n, n_path) and their durations within a force limit."""
         known = [self._archive.x[k][: self._n_path] for k in self._archive.front_indices()]
         paths = np.unique(np.vstack([*known, self._others]), axis=0)
-        return paths, self._method.paths.durations(paths, force)
+        return paths, self._driver.durations(paths, force)
 
     def _widest_gap(self) -> DriveGap | None:
         """Return the largest gap between neighbours with an untried middle; None without any."""
@@ -293,22 +291,10 @@ class DriveRun(PolishRun[DriveAttempt]):
             return self._method.solve_from(attempt.x).run(settings.rounds, LEAST_GAIN)
         return self._method.coarse.solve_from(attempt.x).run(settings.first_rounds)
 
-    def _status(
-        self, attempt: DriveAttempt, answer: Solution | FailedAttempt
-    ) -> tuple[Status, str, Array]:
-        if attempt.moves == "none" and isinstance(answer, Solution):
-            return self._verify(attempt, answer)
-        return super()._status(attempt, answer)
-
     def _classify(
         self, attempt: DriveAttempt, answer: Solution, objectives: Array
     ) -> tuple[Status, str, Array]:
         if self._archive.dominates(objectives):
             return self._not_improved(answer, attempt)
-        recheck = self._recheck(answer.x)
-        return ("rejected", recheck, attempt.start) if recheck else ("accepted", "", objectives)
-
-    def _record(self, attempt: DriveAttempt, outcome: PolishOutcome) -> None:
-        self.outcomes.append(outcome)
-        if outcome.status == "accepted":
-            self._archive.add(outcome.x, outcome.objectives)
+        reason = recheck_timing(self._driver, self._timings, answer.x)
+        return ("rejected", reason, attempt.start) if reason else ("accepted", "", objectives)

@@ -16,7 +16,7 @@ model's points on a chord are nearly as good as those of a solve, and cost a fif
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from functools import partial
 from math import ceil
@@ -32,6 +32,7 @@ from hybrid_opt.polishing.force import (
     scalarisation_for,
 )
 from hybrid_opt.polishing.front import (
+    IMPROVEMENT_TOLERANCE,
     LEAST_SPAN,
     OWN_SHARE,
     Attempt,
@@ -39,7 +40,7 @@ from hybrid_opt.polishing.front import (
     PolishRun,
 )
 from hybrid_opt.polishing.point import Solution
-from hybrid_opt.polishing.records import Aim, PolishOutcome
+from hybrid_opt.polishing.records import Aim, PolishOutcome, Status
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.starts import Start, mirror_of, perturb_start, random_starts
 from symbolic.array import Array, evenly
@@ -170,15 +171,6 @@ def probe_attempt(start: Start, objective: int | None) -> ForceAttempt:
     if `objective` is None."""
     target = scalarisation_for(start.objectives, np.full(2, LEAST_SPAN), objective)
     return ForceAttempt("probe", -1, start.x, start.objectives, target, mode="brief")
-
-
-def successive_halving(
-    pool: list[Start], objective: int | None, solve: Callable[[Start], Start]
-) -> None:
-    """Solve from all starts, then from the better half of the results, until one is left."""
-    while pool:
-        reached = [start if start.is_exhausted else solve(start) for start in pool]
-        pool = better_half(reached, objective)
 
 
 def better_half(reached: list[Start], objective: int | None) -> list[Start]:
@@ -354,8 +346,8 @@ class ForceRun(PolishRun[ForceAttempt]):
         found.residuals = found.residuals.scaled(unit)
         return found
 
-    def run(self, rng: np.random.Generator) -> None:
-        """Process the front's points, then probes far from it, then ends and middle in turns while
+    def attempts(self, rng: np.random.Generator) -> Iterator[ForceAttempt]:
+        """Yield the front's points, then probes far from it, then ends and middle in turns while
         attempts last, then gaps. Mirror images are added throughout, and certified together with
         points on chords in the end."""
         first, fill = front_attempts(self._archive, self._settings), self._settings.fill
@@ -364,43 +356,46 @@ class ForceRun(PolishRun[ForceAttempt]):
         later = len(aims) + min(fill.solved, fill.attempts * self._settings.attempts)
         probes = sum(max(2 * self._starts(objective) - 1, 0) for objective in aims)
         self._announce(self._attempts_left() + probes + later)
-        self._process(first)
+        yield from first
         for objective in aims:
-            self._probe(objective, rng)
+            yield from self._probes(objective, rng)
         self._announce(self._attempts_left() + later)
         while self._attempts_left() > 0:
-            self._attempt_ends((0, 1), rng)
+            yield from self._ends((0, 1), rng)
             if self._stalls[None] < MIDDLE_STALLS:
-                self._attempt_ends((None,), rng)
+                yield from self._ends((None,), rng)
         for objective in aims:
             self._most_attempts += 1
-            self._process([refinement_attempt(self._archive, objective)])
+            yield refinement_attempt(self._archive, objective)
         probed = self._remove_probes()
-        self._fill(fill.solved)
+        yield from self._gaps(fill.solved)
         self._restore_probes(probed)
         self._certify_unproven()
         if len(self._archive.front_indices()) < LEAST_MEMBER_SHARE * fill.members:
             # Chords lead nowhere, or where nothing is proven.
-            self._fill(fill.members)
+            yield from self._gaps(fill.members)
             self._certify_unproven()
 
-    def _probe(self, objective: int | None, rng: np.random.Generator) -> None:
-        """Solve briefly from random feasible candidates and from the front's best point, by
-        successive halving."""
+    def _probes(self, objective: int | None, rng: np.random.Generator) -> Iterator[ForceAttempt]:
+        """Yield short solves from random feasible candidates and from the front's best point, then
+        from the better half of the results, until one is left (successive halving)."""
         count = self._starts(objective)
         if not count:
             return
         k = self._archive.best(objective)[0]
         pool = [Start(self._archive.x[k], self._archive.objectives[k])]
         pool += random_starts(self._evaluator, count - 1, rng)
-
-        def solve(start: Start) -> Start:
-            self._most_attempts += 1
-            self._process([probe_attempt(start, objective)])
-            outcome = self.outcomes[-1]
-            return Start(outcome.x, outcome.objectives, is_exhausted=outcome.status != "accepted")
-
-        successive_halving(pool, objective, solve)
+        while pool:
+            reached = []
+            for start in pool:
+                end = start
+                if not start.is_exhausted:
+                    self._most_attempts += 1
+                    yield probe_attempt(start, objective)
+                    found = self.outcomes[-1]
+                    end = Start(found.x, found.objectives, found.status != "accepted")
+                reached.append(end)
+            pool = better_half(reached, objective)
 
     def _starts(self, objective: int | None) -> int:
         """Return the number of starts of short solves: at most twice the attempts ahead."""
@@ -442,9 +437,9 @@ class ForceRun(PolishRun[ForceAttempt]):
             return True
         return gaps(self._archive)[place - 1].width > FAR_GAP
 
-    def _fill(self, solved: int) -> None:
-        """Process attempts in gaps until the front is complete or no side of a gap is left; then
-        add points on chords."""
+    def _gaps(self, solved: int) -> Iterator[ForceAttempt]:
+        """Yield attempts in gaps until the front is complete or no side of a gap is left; then add
+        points on chords."""
         tried: set[Edge] = set()
         self._most_attempts += self._settings.fill.attempts * self._settings.attempts
         while self._attempts_left() > 0:
@@ -453,7 +448,7 @@ class ForceRun(PolishRun[ForceAttempt]):
                 break
             self._announce(min(self._attempts_left(), solved - len(self._archive.front_indices())))
             tried |= {found.edge, self._reflected(found.edge)}
-            self._process([found.attempt])
+            yield found.attempt
             outcome = self.outcomes[-1]
             if outcome.status == "accepted" and made_little_progress(
                 self._archive, found, outcome.objectives
@@ -486,6 +481,23 @@ class ForceRun(PolishRun[ForceAttempt]):
 
     def _image(self, x: Array) -> Array | None:
         return None if self._mirror is None else self._mirror.image(x)
+
+    def _classify(
+        self, attempt: ForceAttempt, answer: Solution, objectives: Array
+    ) -> tuple[Status, str, Array]:
+        gain = attempt.start - objectives
+        if attempt.aim == "point":
+            if gain.min() < -IMPROVEMENT_TOLERANCE:
+                return "rejected", "an objective became worse", attempt.start
+            if gain.max() <= IMPROVEMENT_TOLERANCE:
+                return self._not_improved(answer, attempt)
+        elif attempt.aim == "probe":
+            # Kept even if dominated: solves may continue from it.
+            if gain.max() <= IMPROVEMENT_TOLERANCE:
+                return self._not_improved(answer, attempt)
+        elif self._archive.dominates(objectives):
+            return "rejected", "dominated", attempt.start
+        return "accepted", "", objectives
 
     def _record(self, attempt: ForceAttempt, outcome: PolishOutcome) -> None:
         super()._record(attempt, outcome)
@@ -523,8 +535,10 @@ class ForceRun(PolishRun[ForceAttempt]):
             self._unproven -= {row.tobytes() for row in x[proven]}
             self._archive.drop([k for k, good in zip(standing, proven, strict=True) if not good])
 
-    def _attempt_ends(self, objectives: tuple[int | None, ...], rng: np.random.Generator) -> None:
-        """Process one attempt per objective, and count those without progress."""
+    def _ends(
+        self, objectives: tuple[int | None, ...], rng: np.random.Generator
+    ) -> Iterator[ForceAttempt]:
+        """Yield one attempt per objective, and count those without progress."""
         perturb = partial(perturb_start, self._evaluator, rng=rng)
         for objective in objectives:
             before, stalls = self._archive.best(objective)[1], self._stalls[objective]
@@ -534,6 +548,6 @@ class ForceRun(PolishRun[ForceAttempt]):
             self._tried.add((objective, attempt.x.tobytes()))
             if (image := self._image(attempt.x)) is not None:
                 self._tried.add((None if objective is None else 1 - objective, image.tobytes()))
-            self._process([attempt])
+            yield attempt
             gained = self._archive.best(objective)[1] < before - LEAST_PROGRESS
             self._stalls[objective] = 0 if gained else stalls + 1

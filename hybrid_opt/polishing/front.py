@@ -9,7 +9,7 @@ from __future__ import annotations
 import ctypes
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,8 +36,6 @@ IMPROVEMENT_TOLERANCE = 1e-6
 
 OPTIMAL_STATIONARITY = 1e-3
 """Stationarity residual below which a point without improvement counts as optimal."""
-
-NO_SOLUTION = Solution(np.empty(0))
 
 
 class ParetoArchive:
@@ -90,13 +88,6 @@ class ParetoArchive:
 
 
 @dataclass(frozen=True)
-class FailedAttempt:
-    """An attempt without a solution; reason: an exception's message."""
-
-    reason: str
-
-
-@dataclass(frozen=True)
 class Attempt:
     """One attempt.
 
@@ -134,12 +125,47 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         self._most_attempts, self._expected, self._on_progress = settings.attempts, 0, on_progress
 
     @abstractmethod
-    def run(self, rng: np.random.Generator) -> None:
-        """Process all attempts."""
+    def attempts(self, rng: np.random.Generator) -> Iterator[AnyAttempt]:
+        """Yield attempts; each one is recorded before the next one is requested."""
 
     @abstractmethod
     def _solve(self, attempt: AnyAttempt) -> Solution:
         """Solve an attempt."""
+
+    @abstractmethod
+    def _classify(
+        self, attempt: AnyAttempt, answer: Solution, objectives: Array
+    ) -> tuple[Status, str, Array]:
+        """Return the status of a feasible answer: accepted, optimal or rejected."""
+
+    def run(self, rng: np.random.Generator) -> None:
+        """Solve, verify and record attempts while any are left."""
+        for attempt in self.attempts(rng):
+            if self._attempts_left() <= 0:
+                continue
+            begin = time.perf_counter()
+            try:
+                answer = self._solve(attempt)
+            except Exception as error:  # ends this attempt only
+                message = f"{type(error).__name__}: {error}".splitlines()[0]
+                answer = Solution(attempt.x, message)
+            status, reason, objectives = self._status(attempt, answer)
+            outcome = PolishOutcome(
+                aim=attempt.aim,
+                parent=attempt.parent,
+                status=status,
+                reason=reason,
+                x=answer.x if status == "accepted" else attempt.x,
+                start=attempt.start,
+                objectives=objectives,
+                residuals=answer.residuals,
+                iterations=answer.iterations,
+                rounds=answer.rounds,
+                rows=answer.rows,
+                seconds=time.perf_counter() - begin,
+            )
+            self._record(attempt, outcome)
+            self._announce(max(self._expected - 1, 0))
 
     def _attempts_left(self) -> int:
         return self._most_attempts - len(self.outcomes)
@@ -148,21 +174,6 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         """Report the expected number of further attempts."""
         self._expected = attempts
         self._on_progress(len(self.outcomes), len(self.outcomes) + attempts)
-
-    def _process(self, attempts: list[AnyAttempt]) -> None:
-        """Solve, evaluate and record attempts."""
-        for attempt in attempts[: max(0, self._attempts_left())]:
-            begin = time.perf_counter()
-            answer = self._solve_guarded(attempt)
-            self._record(attempt, self._outcome(attempt, answer, begin))
-            self._announce(max(self._expected - 1, 0))
-
-    def _solve_guarded(self, attempt: AnyAttempt) -> Solution | FailedAttempt:
-        """Solve an attempt; return an exception as a failed attempt."""
-        try:
-            return self._solve(attempt)
-        except Exception as error:
-            return FailedAttempt(f"{type(error).__name__}: {error}".splitlines()[0])
 
     def _record(self, attempt: AnyAttempt, outcome: PolishOutcome) -> None:
         self.outcomes.append(outcome)
@@ -173,40 +184,14 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         else:
             self._archive.add(outcome.x, outcome.objectives)
 
-    def _outcome(
-        self, attempt: AnyAttempt, answer: Solution | FailedAttempt, begin: float
-    ) -> PolishOutcome:
-        status, reason, objectives = self._status(attempt, answer)
-        solution = answer if isinstance(answer, Solution) else NO_SOLUTION
-        return PolishOutcome(
-            aim=attempt.aim,
-            parent=attempt.parent,
-            status=status,
-            reason=reason,
-            x=solution.x if status == "accepted" else attempt.x,
-            start=attempt.start,
-            objectives=objectives,
-            residuals=solution.residuals,
-            iterations=solution.iterations,
-            rounds=solution.rounds,
-            rows=solution.rows,
-            seconds=time.perf_counter() - begin,
-        )
-
-    def _status(
-        self, attempt: AnyAttempt, answer: Solution | FailedAttempt
-    ) -> tuple[Status, str, Array]:
-        if isinstance(answer, FailedAttempt):
-            return "failed", answer.reason, attempt.start
+    def _status(self, attempt: AnyAttempt, answer: Solution) -> tuple[Status, str, Array]:
+        """Return the status of an answer, its reason and its objectives, after full evaluation and
+        certification between the samples."""
         if not answer.usable:
             return "failed", answer.message, attempt.start
-        if np.array_equal(answer.x, attempt.x):
+        # An answer without any iteration is a point to verify as it is.
+        if answer.rounds and np.array_equal(answer.x, attempt.x):
             return self._not_improved(answer, attempt)
-        return self._verify(attempt, answer)
-
-    def _verify(self, attempt: AnyAttempt, answer: Solution) -> tuple[Status, str, Array]:
-        """Return the status of an answer after full evaluation and certification between the
-        samples."""
         found = self._evaluate(attempt, answer.x)
         reason = int(found.reason[0])
         if reason != FEASIBLE:
@@ -216,24 +201,6 @@ class PolishRun(ABC, Generic[AnyAttempt]):
     def _evaluate(self, attempt: AnyAttempt, x: Array) -> Evaluations:
         """Evaluate x (n_var,) in full and certify it between the samples."""
         return self._evaluator.certified(self._evaluator.evaluate(x))
-
-    def _classify(
-        self, attempt: AnyAttempt, answer: Solution, objectives: Array
-    ) -> tuple[Status, str, Array]:
-        """Return the status of a feasible answer: accepted, optimal or rejected."""
-        gain = attempt.start - objectives
-        if attempt.aim == "point":
-            if gain.min() < -IMPROVEMENT_TOLERANCE:
-                return "rejected", "an objective became worse", attempt.start
-            if gain.max() <= IMPROVEMENT_TOLERANCE:
-                return self._not_improved(answer, attempt)
-        elif attempt.aim == "probe":
-            # Kept even if dominated: solves may continue from it.
-            if gain.max() <= IMPROVEMENT_TOLERANCE:
-                return self._not_improved(answer, attempt)
-        elif self._archive.dominates(objectives):
-            return "rejected", "dominated", attempt.start
-        return "accepted", "", objectives
 
     def _not_improved(self, answer: Solution, attempt: AnyAttempt) -> tuple[Status, str, Array]:
         if answer.converged or answer.residuals.stationarity <= OPTIMAL_STATIONARITY:

@@ -26,7 +26,6 @@ from symbolic.contact.registry import contact_model
 from symbolic.limits import LIMITS, limits_of_block
 from symbolic.path.spline import path_basis
 from symbolic.records.cell import Workcell
-from symbolic.records.task import extended_waypoints
 from symbolic.smooth.driven import (
     DRIVEN_FIRST,
     DRIVEN_SECOND,
@@ -160,10 +159,9 @@ class IntervalGrid:
         )
         return np.asarray(by_path @ self.spread)
 
-    def path(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return the extended pose and both derivatives (intervals + 1, 6 + m) of a decision
-        vector."""
-        waypoints = extended_waypoints(self.workcell.task, x)
+    def path(self, waypoints: Array) -> tuple[Array, Array, Array]:
+        """Return the extended pose and both derivatives (intervals + 1, 6 + m) of extended
+        waypoints (n_waypoints, 6 + m)."""
         first, second, third = (np.ascontiguousarray(b @ waypoints) for b in self._bases)
         return first, second, third
 
@@ -181,19 +179,19 @@ class IntervalValues:
         self,
         grid: IntervalGrid,
         functions: PolishFunctions,
-        x: Array,
+        waypoints: Array,
         squared: Array,
         near: tuple[Array, Array],
     ) -> None:
         """Evaluate.
 
         Args:
-            x: (n_var,) decision vector.
+            waypoints: (n_waypoints, 6 + m) extended waypoints.
             squared: (intervals + 1,) u'^2 at the grid points.
             near: joints of both arms (intervals + 1, n) near those that hold the box.
         """
         self._grid, self._functions = grid, functions
-        path, s, threads = grid.path(x), grid.sample, grid.threads
+        path, s, threads = grid.path(waypoints), grid.sample, grid.threads
         held = [
             functions.closure(arm, "first").batch(path[0], near[arm], threads=threads)
             for arm in (0, 1)

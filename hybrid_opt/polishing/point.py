@@ -317,14 +317,15 @@ class TrustRegionSolve(Generic[AnyIterate, AnyStep]):
         return solution
 
     def _iterate(self) -> None:
+        """Propose a step, evaluate it, and accept or reject the candidate that it leads to."""
         method, best, region = self._method, self.best, self._region
         is_relaxed, self._is_relaxed = (
             self._is_relaxed,
             self._is_relaxed and method.relaxes_until_improved,
         )
-        required = self._working_set.required_values(
-            best.carry, method.limits, best.x, region.radius, is_relaxed
-        )
+        rows = method.active.near_rows(best.carry, method.limits) | self._working_set.rows
+        required = method.active.required_values(best.carry, rows, is_relaxed)
+        self._working_set.tighten(required, best.x, region.radius)
         step = method.propose_step(best, required, region.radius)
         if step is None:
             region.on_failed_subproblem()
@@ -337,41 +338,33 @@ class TrustRegionSolve(Generic[AnyIterate, AnyStep]):
             return
         evaluation = method.evaluate_step(best, step)
         self._is_relaxed = method.relaxes_until_improved and not evaluation.improved
-        if evaluation.trial is None:
+        if (trial := evaluation.trial) is None:
             region.on_no_improvement(step.length, evaluation.factor)
-        elif not self._reject_violating(step, evaluation.trial):
-            if evaluation.improved:
-                self._accept(step, evaluation, evaluation.trial)
-            else:
-                self._keep_best(step, evaluation.trial)
-
-    def _reject_violating(self, step: AnyStep, trial: AnyIterate) -> bool:
-        """Add violated rows to the working set and try fractions of the step; return False if the
-        step violates nothing."""
-        best, carry = self.best, trial.carry
-        violated = self._method.active.violated_rows(carry, best.carry, step.required)
-        if not violated and carry.is_reachable:
-            return False
-        is_new = self._working_set.learn_from_rejection(
-            carry, best.carry, trial.x, violated, step.required
-        )
-        length = step.length if self._method.shrinks_below_step else np.inf
-        self._region.on_reject(is_new and carry.is_reachable, length)
-        for share in self._method.backtracking:
-            if self._try_fraction(best, step, share):
-                break
-        return True
+            return
+        violated = method.active.violated_rows(trial.carry, best.carry, step.required)
+        if violated or not trial.carry.is_reachable:
+            bounds = method.active.tightened_bounds(
+                trial.carry, best.carry, violated, step.required
+            )
+            is_new = self._working_set.learn_from_rejection(bounds, trial.x, step.required)
+            length = step.length if method.shrinks_below_step else np.inf
+            region.on_reject(is_new and trial.carry.is_reachable, length)
+            for share in method.backtracking:
+                if self._try_fraction(best, step, share):
+                    break
+        elif evaluation.improved:
+            self._accept(step, evaluation, trial)
+            for times in method.extrapolation if evaluation.exceeds_prediction else ():
+                if not self._try_fraction(best, step, times, evaluation.keep_active_set):
+                    break
+        else:
+            self._keep_best(step, trial)
 
     def _accept(
         self, step: AnyStep, evaluation: StepEvaluation[AnyIterate], trial: AnyIterate
     ) -> None:
-        begin = self.best
         self._set_best(trial, evaluation.keep_active_set)
         self.solution.converged = step.converged and not self._region.is_step_bounded(step.length)
-        if evaluation.exceeds_prediction:
-            for times in self._method.extrapolation:
-                if not self._try_fraction(begin, step, times, evaluation.keep_active_set):
-                    break
         self._region.on_accept(
             evaluation.fraction * step.length, evaluation.reduction_ratio, evaluation.fraction < 1.0
         )

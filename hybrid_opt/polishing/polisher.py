@@ -12,7 +12,7 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_PAIRS, FORCE_PAIRS, ROBUST_OBJECTIVES
 from hybrid_opt.polishing.cell import PolishFunctions, SmoothCell, polish_functions
 from hybrid_opt.polishing.drive import DriveStepMethod
-from hybrid_opt.polishing.drive_front import DriveRun, recheck_timing
+from hybrid_opt.polishing.drive_front import DriveRun
 from hybrid_opt.polishing.force import ForceSolver
 from hybrid_opt.polishing.force_front import ForceRun
 from hybrid_opt.polishing.front import ParetoArchive, PolishRun
@@ -80,15 +80,6 @@ class Polisher:
         self.drive_method = DriveStepMethod(cell)
         self._timings = TimingModel(evaluator.compiled, self.drive_method.driver.timer.intervals)
 
-    def recheck(self, x: Array) -> str:
-        """Return why a drivable carry's timing fails on the finer grid; '' if the timing holds.
-
-        Args:
-            x: (n_var,) decision vector.
-        """
-        assert self.drive_method is not None
-        return recheck_timing(self.drive_method.driver, self._timings, x)
-
     def polish(
         self,
         front_x: Array,
@@ -118,7 +109,7 @@ class Polisher:
             run = ForceRun(self.solver, self.settings, *given)
         else:
             assert self.drive_method is not None
-            run = DriveRun(self.drive_method, self.settings, self.recheck, *given, known)
+            run = DriveRun(self.drive_method, self.settings, self._timings, *given, known)
         if len(feasible) and self.settings.attempts:
             with one_thread():
                 run.run(rng)

@@ -19,7 +19,7 @@ import numpy as np
 
 from codegen.function import NumericFunction, PreparedBatch
 from hybrid_opt.polishing.cell import Indices, PolishFunctions, SmoothCell
-from hybrid_opt.polishing.native import native
+from hybrid_opt.polishing.solvers.base import native
 from symbolic.array import Array
 from symbolic.records.task import POSE_SIZE
 from symbolic.smooth.places import ORDERS, PathConstraint
@@ -247,11 +247,11 @@ class ConstraintRows:
         }
 
     def _lay_out_places(self, layout: RowLayout, q: tuple[Array, Array]) -> dict[str, Any]:
-        """Sort rows at places by family; the joints of every place are solved once."""
+        """Sort rows at places by their function; the joints of every place are solved once."""
         cell, rows = self._cell, layout.place_rows
-        members: dict[str, list[int]] = {}
+        members: dict[NumericFunction, list[int]] = {}
         for k, row in enumerate(rows):
-            members.setdefault(row.constraint.family, []).append(k)
+            members.setdefault(cell.functions.row(row.constraint, "first"), []).append(k)
         order = np.array([k for own in members.values() for k in own], dtype=np.intp)
         there = np.unique(np.array([row.place for row in rows], dtype=np.intp))
         at = np.searchsorted(there, np.array([rows[k].place for k in order], dtype=np.intp))
@@ -317,7 +317,7 @@ class ConstraintRows:
             first.inputs["numbers"][...] = row_numbers(constraints, functions)[0]
         return {
             "moving": one.moving,
-            "arms": np.array(one.arms(functions.model), dtype=np.intp),
+            "arms": np.array(functions.arms(one), dtype=np.intp),
             "first": first,
             # Not even compiled before: most rows never rule.
             "second": lambda: functions.row(one, "second").prepared(len(constraints)),

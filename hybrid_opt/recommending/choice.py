@@ -209,6 +209,8 @@ class DrivenPaths:
         self._model = robust_model(cell.workcell)
         self.highest_force = cell.workcell.task.force_limit[1]
         self._timer, self.robust = cell.path_timer, cell.force_kind.robust
+        # Each timing has a force limit of its own.
+        self._limits = TimingLimits(force=1.0, robust=self.robust)
         self._known = self._timer.path_limits(self.x)
         self._failures = self._timer.path_errors(self._known)
 
@@ -228,17 +230,18 @@ class DrivenPaths:
             For each path its index, the limit, and the fastest timing.
         """
         chosen = list(range(len(self)) if rows is None else rows)
-        limits = np.broadcast_to(np.asarray(force, dtype=float), (len(chosen),)).tolist()
+        limits = np.broadcast_to(np.asarray(force, dtype=float), (len(chosen),))
         known = self._known
         if rows is not None:
             known = {name: values[chosen] for name, values in known.items()}
         timings = self._timer.time_all(
             self.x[chosen],
-            [TimingLimits(force=limit, robust=self.robust) for limit in limits],
+            self._limits,
+            limits,
             known,
             [self._failures[row] for row in chosen],
         )
-        return list(zip(chosen, limits, timings, strict=True))
+        return list(zip(chosen, limits.tolist(), timings, strict=True))
 
     def durations(self, force: Array | float) -> Array:
         """Compute the shortest duration (k,) of each path within a force limit [s].
@@ -257,7 +260,11 @@ class DrivenPaths:
             force: force limit, one per timed path or one for all [N].
             rows: indices of the paths to time; None for all.
         """
-        return [self._option(*each) for each in self._driven(force, rows) if each[2].ok]
+        found = []
+        for row, limit, timing in self._driven(force, rows):
+            if timing.ok:
+                found.append(self._option(row, limit, timing))
+        return found
 
     def _option(self, row: int, limit: float, timing: PathTiming) -> Option:
         speed = timing.grid_speed
@@ -297,7 +304,8 @@ class DrivenPaths:
             shares = np.linspace(0.0, 1.0, FORCES) ** 2
             limits = [low + share * (self.highest_force - low) for share in shares]
         for k in range(FORCES):
-            found += [option for limit in limits[k : k + 1] for option in self.options(limit)]
+            for limit in limits[k : k + 1]:
+                found += self.options(limit)
             told()
         return found
 

@@ -9,7 +9,7 @@ the limit their tangents are added, and the passes run again (Kelley's cutting p
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from functools import cached_property
 from importlib.resources import files
@@ -23,12 +23,12 @@ from codegen.function import NumericFunction, Signature
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, RobustPath, robust_path
 from hybrid_opt.timing.records import (
+    PER_JOINT,
+    PER_ROBOT,
     PathTiming,
     Place,
     TimingLimits,
     TimingStatus,
-    failed_timing,
-    limit_place,
 )
 from symbolic.array import Array
 from symbolic.contact.registry import command_model, contact_model
@@ -84,31 +84,26 @@ class ForwardBackwardPasses:
         with a scalar squeeze."""
         return self._has_scalar_squeeze or not limits.robust
 
-    def time(self, paths: Mapping[str, Array], limits: Sequence[TimingLimits]) -> list[PathTiming]:
-        """Compute the fastest timing of each of n paths within its own limits.
+    def time(
+        self, paths: Mapping[str, Array], limits: TimingLimits, force: Array | None = None
+    ) -> list[PathTiming]:
+        """Compute the fastest timing of each of n paths.
 
         Args:
             paths: coefficients by name: limits (n, 2 intervals + 1, columns of
-                `symbolic.limits.limit_layout`); if any limit is robust also pose, pose_first and
+                `symbolic.limits.limit_layout`); for robust limits also pose, pose_first and
                 pose_second (n, 2 intervals + 1, 6 or more).
-            limits: n sets of limits that the passes support.
+            limits: limits of all paths, which the passes support.
+            force: (n,) force limit of each path in place of that of `limits` [N].
         """
-        found: list[PathTiming | None] = [None] * len(limits)
-        for robust in (False, True):
-            some = [row for row, each in enumerate(limits) if each.robust is robust]
-            if not some:
-                continue
-            options = np.array([_options(limits[row]) for row in some])
-            # All of them without a copy.
-            chosen = paths if len(some) == len(limits) else {k: v[some] for k, v in paths.items()}
-            if robust:
-                timings = self._time_robust(chosen, options)
-            else:
-                out = self._passes.batch(chosen["limits"], options, threads=self._threads)
-                timings = [self._timing(out, k) for k in range(len(some))]
-            for row, timing in zip(some, timings, strict=True):
-                found[row] = timing
-        return [timing for timing in found if timing is not None]
+        most = np.inf if limits.force is None else limits.force
+        options = np.empty((len(paths["limits"]), 4))
+        options[:, 0] = most if force is None else force
+        options[:, 1:] = limits.torque, limits.pressure, limits.reference_speed
+        if limits.robust:
+            return self._time_robust(paths, options)
+        out = self._passes.batch(paths["limits"], options, threads=self._threads)
+        return [self._timing(out, k) for k in range(len(options))]
 
     def _time_robust(self, paths: Mapping[str, Array], options: Array) -> list[PathTiming]:
         drive = RobustCuttingPlanes(self._cut_passes, robust_path(self.workcell), paths, options)
@@ -153,11 +148,6 @@ class ForwardBackwardPasses:
             sweeps=int(out["sweeps"][k]),
             slowed=float(out["slowed"][k]),
         )
-
-
-def _options(limits: TimingLimits) -> list[float]:
-    force = float("inf") if limits.force is None else limits.force
-    return [force, float(limits.torque), float(limits.pressure), float(limits.reference_speed)]
 
 
 class RobustCuttingPlanes:
@@ -394,3 +384,77 @@ def _source(workcell: Workcell, intervals: int, cuts: int) -> tuple[Signature, s
 def joint_names(robot: Robot) -> tuple[str, ...]:
     """Return the names of a robot's joints in the order of q."""
     return tuple(arm_model(robot).names)[1:]
+
+
+# --- places of limits, and paths without a timing ---
+
+
+LEAST_MOTION = 1e-9
+"""Box and joints count as standing still if they move less along the whole path [m, rad]."""
+
+ARM_CHECKS = (
+    (TimingStatus.OFF_PATH, "reach", "loses the path"),
+    (TimingStatus.JOINT_LIMITS, "joint position", "leaves its joint range"),
+    (TimingStatus.NEAR_SINGULAR, "manipulability", "comes too near a singular posture"),
+)
+"""Errors of an arm along a path, in the order in which they are reported: timing status, name of
+the condition in a `Place`, and a phrase that says what the robot fails to do."""
+
+
+def limit_place(
+    workcell: Workcell,
+    joint_names: tuple[tuple[str, ...], ...],
+    constraint: str,
+    column: int,
+    sample: int,
+    parameter: float,
+) -> Place:
+    """Return the place at which a limit is used most.
+
+    Args:
+        joint_names: names of the joints of each arm.
+        constraint: name of the limit.
+        column: column of `CarryLimits.ratios` of this limit: a joint, a robot, or 0.
+        sample: index of the sample.
+        parameter: path parameter u in [0, 1].
+    """
+    robot, joint = "", ""
+    if constraint in PER_JOINT:
+        arm = int(column >= len(joint_names[0]))
+        joint = joint_names[arm][column - arm * len(joint_names[0])]
+        robot = workcell.robots[arm].name
+    elif constraint in PER_ROBOT:
+        robot = workcell.robots[column].name
+    return Place(constraint, robot, joint, sample, parameter)
+
+
+def failed_timing(status: TimingStatus, place: Place, intervals: int) -> PathTiming:
+    """Return the `PathTiming` of a path that cannot be timed."""
+    speed = np.zeros(intervals + 1)
+    return PathTiming(status, place, float("inf"), np.full(2, np.nan), {}, speed)
+
+
+def path_failure(
+    workcell: Workcell, pose: Array, lost: Array, limit_margin: Array, manipulability: Array
+) -> tuple[TimingStatus, Place, str] | None:
+    """Return status, place and reason of the error of a path on which nothing moves or an arm
+    fails, else None.
+
+    Args:
+        pose: (n, 6) box poses at uniform samples.
+        lost, limit_margin, manipulability: (n, 2) outputs of `symbolic.robot.arm.TRACK_OUTPUTS` of
+            these names, by sample and arm.
+    """
+    if float(np.abs(pose - pose[0]).max()) < LEAST_MOTION:
+        reason = "all poses of the path are the same: there is nothing to time"
+        return TimingStatus.NO_MOTION, Place("path length", "", "", 0, 0.0), reason
+    least = [robot.min_manipulability for robot in workcell.robots]
+    found = (lost > 0.5, limit_margin < 0.0, manipulability < least)
+    for failed, (status, constraint, text) in zip(found, ARM_CHECKS, strict=True):
+        if failed.any():
+            sample = int(np.argmax(failed.any(axis=1)))
+            robot = workcell.robots[int(np.argmax(failed[sample]))].name
+            place = Place(constraint, robot, "", sample, sample / (len(pose) - 1))
+            reason = f"robot {robot!r} {text} at u = {place.parameter:.4f}"
+            return status, place, reason
+    return None

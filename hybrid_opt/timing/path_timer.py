@@ -9,6 +9,7 @@ within this limit and all limits of robots, payload and contacts.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -25,14 +26,8 @@ from hybrid_opt.carry import (
 )
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.timing.model import TimingModel, require_intervals, sample_limits_set
-from hybrid_opt.timing.passes import ForwardBackwardPasses
-from hybrid_opt.timing.records import (
-    PathTiming,
-    TimingLimits,
-    TimingStatus,
-    arm_path_error,
-    failed_timing,
-)
+from hybrid_opt.timing.passes import ForwardBackwardPasses, failed_timing, path_failure
+from hybrid_opt.timing.records import PathTiming, TimingLimits, TimingStatus
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -123,7 +118,7 @@ class PathTimer:
         Raises:
             SettingsError: x has the wrong shape or is not finite.
         """
-        (timing,) = self.time_all(np.asarray(x, dtype=float)[None], [limits])
+        (timing,) = self.time_all(np.asarray(x, dtype=float)[None], limits)
         return timing
 
     def path_errors(self, paths: dict[str, Array]) -> list[PathTiming | None]:
@@ -136,50 +131,54 @@ class PathTimer:
         names = ("lost", "limit_margin", "manipulability")
         sides = [np.stack([paths[f"{name}_{arm}"] for arm in (1, 2)], axis=2) for name in names]
         found = [
-            arm_path_error(self.workcell, pose[:, :6], *each)
+            path_failure(self.workcell, pose[:, :6], *each)
             for pose, *each in zip(paths["pose"], *sides, strict=True)
         ]
         return [
-            None if error is None else failed_timing(error.status, error.place, self.intervals)
-            for error in found
+            None if failure is None else failed_timing(*failure[:2], self.intervals)
+            for failure in found
         ]
 
     def time_all(
         self,
         x: Array,
-        limits: Sequence[TimingLimits],
+        limits: TimingLimits,
+        force: Array | None = None,
         paths: dict[str, Array] | None = None,
         path_errors: Sequence[PathTiming | None] | None = None,
     ) -> list[PathTiming]:
-        """Compute the fastest timing of each of n paths within its own limits.
+        """Compute the fastest timing of each of n paths.
 
         Args:
             x: (n, n_var) free waypoints.
-            limits: n sets of limits in addition to the workcell's.
+            limits: limits of all paths, in addition to the workcell's.
+            force: (n,) force limit of each path in place of that of `limits` [N].
             paths, path_errors: results of `path_limits` and `path_errors`; computed if None.
 
         Raises:
-            SettingsError: x has the wrong shape or is not finite.
+            SettingsError: x has the wrong shape or is not finite, or a force limit is not positive.
         """
         x = np.ascontiguousarray(x, dtype=float)
         (n_var,) = self._path.input_shapes[0]
-        if x.shape != (len(limits), n_var) or not np.isfinite(x).all():
+        if x.ndim != 2 or x.shape[1] != n_var or not np.isfinite(x).all():
             raise SettingsError(
-                f"waypoints of shape {x.shape}; needs {len(limits)} rows of {n_var} finite numbers",
-                code="shape",
+                f"waypoints of shape {x.shape}; needs rows of {n_var} finite numbers", code="shape"
             )
+        if force is not None and not ((force > 0.0) & (force < np.inf)).all():
+            raise SettingsError("force limits of paths: give finite positive forces", code="force")
         paths = self.path_limits(x) if paths is None else paths
         found = list(self.path_errors(paths) if path_errors is None else path_errors)
         rows = [row for row, error in enumerate(found) if error is None]
-        fast = [row for row in rows if self.passes.supports(limits[row])]
-        if fast:
-            chosen = paths if len(fast) == len(x) else {k: v[fast] for k, v in paths.items()}
-            timings = self.passes.time(chosen, [limits[row] for row in fast])
-            for row, timing in zip(fast, timings, strict=True):
+        if self._model is not None and not self.passes.supports(limits):
+            for row in rows:
+                own = limits if force is None else replace(limits, force=float(force[row]))
+                found[row] = _as_path_timing(self._model, x[row], own)
+        elif rows:
+            if len(rows) < len(x):
+                paths = {name: values[rows] for name, values in paths.items()}
+                force = None if force is None else force[rows]
+            for row, timing in zip(rows, self.passes.time(paths, limits, force), strict=True):
                 found[row] = timing
-        if self._model is not None:
-            for row in set(rows).difference(fast):
-                found[row] = _as_path_timing(self._model, x[row], limits[row])
         return [timing for timing in found if timing is not None]
 
 
@@ -209,7 +208,27 @@ def _as_path_timing(model: TimingModel, x: Array, limits: TimingLimits) -> PathT
 # --- candidates of drivable cells ---
 
 
+LEAST_FORCE_LIMIT = 1e-9
+"""Least force limit of a candidate [N]: no timing has none."""
+
 _AT_REST = {"normal force": FORCE_LIMIT, "joint torque": JOINT_TORQUE}
+
+
+@dataclass(frozen=True)
+class TimedCandidate:
+    """A candidate with its fastest timing.
+
+    Attributes:
+        timing: the timing, or its error.
+        duration: [s], infinite without a timing that respects every limit.
+        squared: (intervals + 1,) u'^2 at the grid points.
+        joints: of both arms at the grid points (intervals + 1, n) [rad].
+    """
+
+    timing: PathTiming
+    duration: float
+    squared: Array
+    joints: tuple[Array, Array]
 
 
 class CandidateDriver:
@@ -225,11 +244,23 @@ class CandidateDriver:
         self._task = timer.workcell.task
         self._threads = threads
         self.timer, self.robust = timer, robust
-        self._last: tuple[bytes, PathTiming, dict[str, Array]] | None = None
+        # Force limits are the candidates' own.
+        self._limits = TimingLimits(force=1.0, robust=robust)
+        self._last: tuple[bytes, TimedCandidate] | None = None
 
     def limits(self, force: float) -> TimingLimits:
         """Return the timing limits of a candidate with this force limit [N]."""
-        return TimingLimits(force=max(force, 1e-9), robust=self.robust)
+        return TimingLimits(force=max(force, LEAST_FORCE_LIMIT), robust=self.robust)
+
+    def time_paths(self, paths: Array, force: Array) -> list[PathTiming]:
+        """Compute the fastest timings of paths (n, n_path) within force limits (n,) [N]."""
+        return self.timer.time_all(paths, self._limits, np.maximum(force, LEAST_FORCE_LIMIT))
+
+    def durations(self, paths: Array, force: float) -> Array:
+        """Compute durations (n,) [s] of paths (n, n_path) within a force limit [N], infinite
+        without a timing."""
+        found = self.time_paths(paths, np.full(len(paths), force))
+        return np.array([t.duration if t.status is TimingStatus.OK else np.inf for t in found])
 
     def outputs(self, candidate: NumericFunction, x: Array) -> dict[str, Array]:
         """Compute every per-sample output of n candidates under their timings.
@@ -245,10 +276,10 @@ class CandidateDriver:
             largest normal forces over all cases of the workcell's uncertainty [N].
         """
         if len(x) == 1:
-            timings = [self.time_candidate(x[0])[0]]
+            timings = [self.time_candidate(x[0]).timing]
         else:
-            limits = [self.limits(float(force)) for force in x[:, -1]]
-            timings = self.timer.time_all(x[:, : self._task.n_path], limits)
+            force = np.maximum(x[:, -1], LEAST_FORCE_LIMIT)
+            timings = self.timer.time_all(x[:, : self._task.n_path], self._limits, force)
         u = np.linspace(0.0, 1.0, self._task.samples)
         # An axis of three that no candidates leave empty, too.
         driven = np.array([_speed_profile_at(timing, u) for timing in timings]).reshape(
@@ -278,16 +309,19 @@ class CandidateDriver:
             position[row] = timing.place.parameter
         return outputs | {"drive_violation": violation, "drive_position": position}
 
-    def time_candidate(self, x: Array) -> tuple[PathTiming, dict[str, Array]]:
-        """Compute the timing of one decision vector (n_var,), and the `path_limits` of its path.
-        The last result is cached, because a polish asks for it several times in a row."""
+    def time_candidate(self, x: Array) -> TimedCandidate:
+        """Compute the timing of one decision vector (n_var,). The last result is cached, because a
+        polish asks for it several times in a row."""
         key = x.tobytes()
         if self._last is None or self._last[0] != key:
-            path = np.ascontiguousarray(x[None, : self._task.n_path], dtype=float)
+            path, force = x[None, : self._task.n_path], np.maximum(x[-1:], LEAST_FORCE_LIMIT)
             known = self.timer.path_limits(path)
-            (timing,) = self.timer.time_all(path, [self.limits(float(x[-1]))], known)
-            self._last = key, timing, known
-        return self._last[1:]
+            (timing,) = self.timer.time_all(path, self._limits, force, known)
+            duration = timing.duration if timing.status is TimingStatus.OK else np.inf
+            q_1, q_2 = (np.ascontiguousarray(known[f"q_{arm}"][0][::2]) for arm in (1, 2))
+            squared = timing.grid_speed**2
+            self._last = key, TimedCandidate(timing, duration, squared, (q_1, q_2))
+        return self._last[1]
 
 
 def _speed_profile_at(timing: PathTiming, u: Array) -> tuple[Array, Array, Array]:
@@ -316,7 +350,7 @@ def search_timing(model: TimingModel, x: Array) -> PathTiming:
     Raises:
         SettingsError: x does not fit the workcell.
     """
-    return _driver_of(model).time_candidate(model.checked(x))[0]
+    return _driver_of(model).time_candidate(model.checked(x)).timing
 
 
 def search_carry(model: TimingModel, x: Array) -> Carry:

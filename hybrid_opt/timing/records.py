@@ -61,33 +61,6 @@ class Place:
         return f"{self.constraint}{f' of {who}' if who else ''} at u = {self.parameter:.4f}"
 
 
-def limit_place(
-    workcell: Workcell,
-    joint_names: tuple[tuple[str, ...], ...],
-    constraint: str,
-    column: int,
-    sample: int,
-    parameter: float,
-) -> Place:
-    """Return the place at which a limit is used most.
-
-    Args:
-        joint_names: names of the joints of each arm.
-        constraint: name of the limit.
-        column: column of `CarryLimits.ratios` of this limit: a joint, a robot, or 0.
-        sample: index of the sample.
-        parameter: path parameter u in [0, 1].
-    """
-    robot, joint = "", ""
-    if constraint in PER_JOINT:
-        arm = int(column >= len(joint_names[0]))
-        joint = joint_names[arm][column - arm * len(joint_names[0])]
-        robot = workcell.robots[arm].name
-    elif constraint in PER_ROBOT:
-        robot = workcell.robots[column].name
-    return Place(constraint, robot, joint, sample, parameter)
-
-
 @dataclass(frozen=True)
 class TimingLimits:
     """Limits in addition to the workcell's speeds and accelerations, which always apply.
@@ -316,50 +289,3 @@ class PathTiming:
         limited, else planned."""
         known = self.peak_force if self.robust_force is None else self.robust_force
         return float(known.max())
-
-
-def failed_timing(status: TimingStatus, place: Place, intervals: int) -> PathTiming:
-    """Return the `PathTiming` of a path that cannot be timed."""
-    speed = np.zeros(intervals + 1)
-    return PathTiming(status, place, float("inf"), np.full(2, np.nan), {}, speed)
-
-
-# --- errors of a path ---
-
-
-LEAST_MOTION = 1e-9
-"""Box and joints count as standing still if they move less along the whole path [m, rad]."""
-
-ARM_CHECKS = (
-    (TimingStatus.OFF_PATH, "reach", "loses the path"),
-    (TimingStatus.JOINT_LIMITS, "joint position", "leaves its joint range"),
-    (TimingStatus.NEAR_SINGULAR, "manipulability", "comes too near a singular posture"),
-)
-"""Errors of an arm along a path, in the order in which they are reported: timing status, name of
-the condition in a `Place`, and a phrase that says what the robot fails to do."""
-
-
-def arm_path_error(
-    workcell: Workcell, pose: Array, lost: Array, limit_margin: Array, manipulability: Array
-) -> Timing | None:
-    """Return the error of a path on which nothing moves or an arm fails, with arm and place; else
-    None.
-
-    Args:
-        pose: (n, 6) box poses at uniform samples.
-        lost, limit_margin, manipulability: (n, 2) outputs of `symbolic.robot.arm.TRACK_OUTPUTS` of
-            these names, by sample and arm.
-    """
-    if float(np.abs(pose - pose[0]).max()) < LEAST_MOTION:
-        reason = "all poses of the path are the same: there is nothing to time"
-        return Timing(TimingStatus.NO_MOTION, reason, Place("path length", "", "", 0, 0.0), None)
-    least = [robot.min_manipulability for robot in workcell.robots]
-    found = (lost > 0.5, limit_margin < 0.0, manipulability < least)
-    for failed, (status, constraint, text) in zip(found, ARM_CHECKS, strict=True):
-        if failed.any():
-            sample = int(np.argmax(failed.any(axis=1)))
-            robot = workcell.robots[int(np.argmax(failed[sample]))].name
-            place = Place(constraint, robot, "", sample, sample / (len(pose) - 1))
-            reason = f"robot {robot!r} {text} at u = {place.parameter:.4f}"
-            return Timing(status, reason, place, None)
-    return None

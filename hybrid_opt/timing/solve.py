@@ -12,6 +12,7 @@ import numpy as np
 
 from hybrid_opt.carry import Carry
 from hybrid_opt.timing.model import CarryLimits, PathMotion, SpeedProfile, TimingModel
+from hybrid_opt.timing.passes import limit_place, path_failure
 from hybrid_opt.timing.records import (
     FRICTION_RATIO,
     PER_JOINT,
@@ -21,8 +22,6 @@ from hybrid_opt.timing.records import (
     TimingStatus,
     Utilisation,
     Validation,
-    arm_path_error,
-    limit_place,
 )
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -89,7 +88,7 @@ def _error_at_rest(model: TimingModel, motion: PathMotion, limits: TimingLimits)
 def _run_passes(
     model: TimingModel, motion: PathMotion, limits: TimingLimits
 ) -> PathTiming | Timing:
-    (found,) = model.passes.time(model.path_coefficients(motion), [limits])
+    (found,) = model.passes.time(model.path_coefficients(motion), limits)
     return found if np.isfinite(found.duration) else _pass_error(found, model.intervals)
 
 
@@ -167,7 +166,11 @@ def _slow_down(
 def path_error(model: TimingModel, motion: PathMotion) -> Timing | None:
     """Return the error of a path on which nothing moves or an arm fails, else None."""
     arms = motion.lost, motion.limit_margin, motion.manipulability
-    return arm_path_error(model.workcell, motion.pose, *arms)
+    failure = path_failure(model.workcell, motion.pose, *arms)
+    if failure is None:
+        return None
+    status, place, reason = failure
+    return Timing(status, reason, place, None)
 
 
 def check_limits(

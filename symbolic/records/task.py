@@ -207,20 +207,22 @@ class Task:
         limit."""
         return self.n_path + self.law.is_drivable
 
-    @property
+    @cached_property
     def lower(self) -> Array:
-        """(n_var,) lower bounds of the decision vector."""
+        """(n_var,) lower bounds of the decision vector; read-only."""
         return self._bounds("lower", self.force_limit[0])
 
-    @property
+    @cached_property
     def upper(self) -> Array:
-        """(n_var,) upper bounds of the decision vector."""
+        """(n_var,) upper bounds of the decision vector; read-only."""
         return self._bounds("upper", self.force_limit[1])
 
     def _bounds(self, name: str, force: float) -> Array:
         parts = [getattr(self.waypoints[i], name) for i in self.free_indices]
         parts += [getattr(joint, name)[joint.moving] for joint in self.redundant]
-        return np.concatenate(parts + ([np.array([force])] if self.law.is_drivable else []))
+        bounds = np.concatenate(parts + ([np.array([force])] if self.law.is_drivable else []))
+        bounds.flags.writeable = False
+        return bounds
 
 
 # --- the decision vector ---

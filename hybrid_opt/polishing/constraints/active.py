@@ -167,48 +167,38 @@ class WorkingSet:
         self._tightened: dict[Row, tuple[float, Array]] = {}
         self._active_for: dict[Row, int] = {}
 
-    def required_values(
-        self, carry: PlacedCarry, limits: MinimisedForces, x: Array, radius: float, is_relaxed: bool
-    ) -> dict[Row, float]:
-        """Return the rows of the next program about a candidate, with their required values.
+    @property
+    def rows(self) -> set[Row]:
+        """Return the rows that the next program has beside those near their bounds."""
+        return {*self._tightened, *self._active_for}
+
+    def tighten(self, required: dict[Row, float], x: Array, radius: float) -> None:
+        """Raise the required values of the next program's rows, in place.
 
         Args:
-            carry: the candidate at places of the path.
-            limits: whether the force of each robot is minimised.
-            x: variables of the candidate, (n,) or more.
+            required: all rows of the program, and their required values.
+            x: variables of the candidate that the program is about, (n,) or more.
             radius: radius of the trust region.
-            is_relaxed: True to require no more than a feasible candidate satisfies.
         """
-        rows = (
-            self._active.near_rows(carry, limits) | self._tightened.keys() | self._active_for.keys()
-        )
-        required = self._active.required_values(carry, rows, is_relaxed)
         for row, (value, tightened_at) in self._tightened.items():
             n = len(self._half)
             far = float(np.abs((tightened_at[:n] - x[:n]) / self._half).max())
             share = min(1.0, radius / max(far, 1e-300))
             required[row] += share * max(value - required[row], 0.0)
-        return required
 
     def learn_from_rejection(
-        self,
-        carry: PlacedCarry,
-        known: PlacedCarry,
-        x: Array,
-        violated: Iterable[Row],
-        required: Mapping[Row, float],
+        self, bounds: Mapping[Row, float], x: Array, required: Mapping[Row, float]
     ) -> bool:
         """Add the rows that a rejected step to x violates; return True if any row is new or gets a
         tighter bound.
 
         Args:
-            carry, known: candidate after and before the step.
+            bounds: the violated rows, and their tightened bounds.
             x: decision vector after the step.
-            violated: the violated rows.
             required: rows of the program and their required values.
         """
         is_new = False
-        for row, value in self._active.tightened_bounds(carry, known, violated, required).items():
+        for row, value in bounds.items():
             tightened = self._tightened[row][0] if row in self._tightened else -np.inf
             is_new |= value > max(required.get(row, -np.inf), tightened) + LEAST_TIGHTENING
             if value > tightened:

@@ -11,6 +11,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from codegen.function import NumericFunction
 from hybrid_opt.polishing.carry import PlacedCarry, local_minima_below
 from hybrid_opt.polishing.cell import SmoothCell
 from hybrid_opt.polishing.rows import PROGRAM_BRANCH, ForceRow, PathRow, PressureRow, row_numbers
@@ -295,14 +296,12 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
 def smooth_values(cell: SmoothCell, carry: PlacedCarry, rows: Sequence[PathRow]) -> Array:
     """Evaluate rows in the smooth model."""
     values = np.empty(len(rows))
-    groups: dict[str, list[int]] = {}
+    functions, groups = cell.functions, dict[NumericFunction, list[int]]()
     for k, row in enumerate(rows):
-        groups.setdefault(row.constraint.family, []).append(k)
-    for members in groups.values():
+        groups.setdefault(functions.row(row.constraint, "first"), []).append(k)
+    for function, members in groups.items():
         at = [rows[k].place for k in members]
-        functions, kinds = cell.functions, [rows[k].constraint for k in members]
         inputs = [array[at] for array in (carry.pose, carry.rate, *carry.q)]
-        inputs += row_numbers(kinds, functions)
-        function = functions.row(kinds[0], "first")
+        inputs += row_numbers([rows[k].constraint for k in members], functions)
         values[members] = function.batch(*inputs)["value"]
     return values

@@ -1,4 +1,4 @@
-"""Interface of nonlinear programs and their solvers.
+"""Interface of nonlinear programs and their solvers, and the polish's compiled part.
 
 A solver's report of optimality is not trusted: `optimality_residuals` recomputes it from the
 program.
@@ -8,11 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from functools import cache
+from typing import Any, Protocol
 
 import numpy as np
 
 from symbolic.array import Array, Figure
+from symbolic.robot.bridge import compiled_module
 
 OPTIMALITY_TOLERANCE = 1e-6
 """Tolerance of the optimality conditions, in scaled rows and variables."""
@@ -33,6 +35,17 @@ ACTIVE_SLACK = 0.1
 
 NNLS_ITERATIONS = 30
 """Iterations of the least-squares method per inequality."""
+
+
+@cache
+def native() -> Any:
+    """Return the module of `rows.cpp`, `solvers/dense.cpp` and `solvers/quadratic.cpp`, which is
+    the same for every cell and compiled at installation.
+
+    Raises:
+        BridgeError: it is missing or cannot be loaded.
+    """
+    return compiled_module("hybrid_opt.polishing._native", "the compiled part of the polish")
 
 
 class NonlinearProgram(Protocol):

@@ -20,13 +20,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from hybrid_opt.polishing.native import native
 from hybrid_opt.polishing.solvers.base import (
     FEASIBILITY_PATIENCE,
     FEASIBLE_ROW,
     OPTIMALITY_TOLERANCE,
     Answer,
     NonlinearProgram,
+    native,
 )
 
 

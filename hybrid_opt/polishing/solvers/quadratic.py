@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.linalg import eigvalsh_tridiagonal, lapack
 
-from hybrid_opt.polishing.native import native
+from hybrid_opt.polishing.solvers.base import native
 from symbolic.array import Array
 
 QUADRATIC_TOLERANCE = 1e-8

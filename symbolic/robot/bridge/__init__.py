@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from functools import cache
 from importlib import import_module
-from types import ModuleType
+from typing import Any
 
 import casadi
 import pinocchio
@@ -83,15 +83,29 @@ def require_same_minor(built: dict[str, str], installed: dict[str, str]) -> None
         )
 
 
-@cache
-def _extension() -> ModuleType:
-    """Import the compiled module, after casadi and pinocchio have loaded its libraries."""
+def compiled_module(name: str, part: str) -> Any:
+    """Import one of the project's compiled modules.
+
+    Args:
+        name: name of the module; the libraries that it links to have been loaded already.
+        part: name of the module for people, as in 'the compiled part of the polish'.
+
+    Raises:
+        BridgeError: the module is missing or cannot be loaded.
+    """
     try:
-        extension = import_module("symbolic.robot.bridge._pinocchio_casadi")
+        return import_module(name)
     except ImportError as error:
         raise BridgeError(
-            f"the Pinocchio-CasADi bridge cannot be loaded ({error}); {REMEDY}", code="not-loadable"
+            f"{part} cannot be loaded ({error}); {REMEDY}", code="not-loadable"
         ) from error
+
+
+@cache
+def _extension() -> Any:
+    """Import the compiled module, after casadi and pinocchio have loaded its libraries."""
+    name = "symbolic.robot.bridge._pinocchio_casadi"
+    extension = compiled_module(name, "the Pinocchio-CasADi bridge")
     require_same_minor(
         {"pinocchio": extension.PINOCCHIO_VERSION, "casadi": extension.CASADI_VERSION},
         {"pinocchio": pinocchio.__version__, "casadi": casadi.CasadiMeta.version()},

@@ -79,7 +79,7 @@ def disbelieved(driver: CandidateDriver | None, model: TimingModel, x: Array) ->
     """Why the timing of a decision vector is not believed: by the tenfold grid, or by the
     independent one."""
     assert driver is not None
-    found, other = driver.time_candidate(x)[0], by_toppra(model, x, driver.limits(float(x[-1])))
+    found, other = driver.time_candidate(x).timing, by_toppra(model, x, driver.limits(float(x[-1])))
     if not other.ok or abs(found.duration / other.duration - 1.0) > 5e-3:
         return f"{found.duration:.3f} s, by the independent timing {other.duration:.3f} s"
     return recheck_timing(driver, model, x)

@@ -143,13 +143,15 @@ def memory() -> WorkingSet:
 
 
 def required(known: WorkingSet, radius: float = 0.2) -> dict[Row, float]:
-    return known.required_values(NOTHING, (True, True), HERE, radius, is_relaxed=False)
+    values = dict.fromkeys({NEAR} | known.rows, 1.0)
+    known.tighten(values, HERE, radius)
+    return values
 
 
 @pytest.mark.parametrize(("radius", "share"), [(0.4, 1.0), (0.2, 1.0), (0.1, 0.5), (0.0, 0.0)])
 def test_what_a_step_taught_counts_as_far_as_the_box_reaches(radius: float, share: float) -> None:
     known = memory()
-    assert known.learn_from_rejection(NOTHING, NOTHING, THERE, [FAR], {})
+    assert known.learn_from_rejection({FAR: 3.0}, THERE, {})
     assert required(known, radius) == pytest.approx({NEAR: 1.0, FAR: 1.0 + 2.0 * share})
 
 

@@ -81,7 +81,7 @@ def test_most_points_end_stationary() -> None:
 
 def test_a_start_that_cannot_be_driven_is_told() -> None:
     x = np.append(evaluator().lower[:-1], 52.0)
-    assert not np.isfinite(drive_method().paths.fastest_timing(np.append(x[:-1], 52.0)).duration)
+    assert not np.isfinite(drive_method().driver.time_candidate(np.append(x[:-1], 52.0)).duration)
     solution = solved(drive_method(), x)
     assert not solution.usable
     assert solution.message == "the start cannot be judged"
@@ -136,7 +136,7 @@ def guess(x: Array, force: float) -> Guess:
 
 def compiled_duration(path: Array, force: float) -> float:
     """Of the compiled timing with every limit, on its finer grid."""
-    return open_way().paths.fastest_timing(np.append(path, force)).duration
+    return open_way().driver.time_candidate(np.append(path, force)).duration
 
 
 @pytest.mark.slow

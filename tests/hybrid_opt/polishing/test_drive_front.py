@@ -64,7 +64,7 @@ def test_the_front_dominates_more_than_before() -> None:
 
 def fastest(paths: Array, forces: Array) -> Array:
     """(n,) [s] of any of some paths (k, n_path) within each force."""
-    judge = drive_method().paths
+    judge = drive_method().driver
     return np.array([judge.durations(paths, float(force)).min() for force in forces])
 
 

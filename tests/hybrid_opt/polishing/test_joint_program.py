@@ -54,7 +54,7 @@ class Programs:
         half, self.x = self.cell.half[:-1], x
         own: Array = np.eye(len(half)) if together is None else together
         spread: Array = half[:, None] * own
-        self.timed = drive_method_of(owner).paths.fastest_timing(x)
+        self.timed = drive_method_of(owner).driver.time_candidate(x)
         self.carry = CarryReader(self.cell).read(x)
         self.intervals = IntervalGrid(self.cell.workcell, 100, spread)
 
@@ -66,7 +66,7 @@ class Programs:
             x[: len(spread)] += spread @ d[: spread.shape[1]]
             squared[1:-1] *= 1.0 + d[-len(squared) + 2 :]
         functions, joints = self.cell.functions, self.timed.joints
-        values = IntervalValues(self.intervals, functions, x, squared, joints)
+        values = IntervalValues(self.intervals, functions, self.cell.waypoints(x), squared, joints)
         required: dict[Row, float] = dict.fromkeys(ROWS, 0.01)
         grid = self.intervals
         return PathTimingProgram(grid, values, x, squared, self.cell, required, self.carry)
@@ -204,7 +204,7 @@ def test_a_carry_is_driven_better_believed_and_stationary(fork: Polisher) -> Non
     solution = solved(drive_method, x)
     assert evaluator.certified(evaluator.evaluate(solution.x)).feasible[0]
     driven = (np.append(each[:-1], FORK_FORCE) for each in (x, solution.x))
-    before, after = (drive_method.paths.fastest_timing(each).duration for each in driven)
+    before, after = (drive_method.driver.time_candidate(each).duration for each in driven)
     assert after < 0.85 * before
     model = TimingModel(evaluator.compiled, 100)
     assert disbelieved(evaluator.driver, model, solution.x) == ""
@@ -236,10 +236,10 @@ def test_derivatives_of_redundant_joints_are_exact(rail: Polisher) -> None:
 def test_a_carry_with_a_redundant_joint_is_driven_better_and_believed(rail: Polisher) -> None:
     evaluator, drive_method = rail.evaluator, drive_method_of(rail)
     x = start_in(evaluator.workcell, RAIL_FORCE, 0)
-    begun = drive_method.paths.fastest_timing(np.append(x[:-1], RAIL_FORCE)).duration
+    begun = drive_method.driver.time_candidate(np.append(x[:-1], RAIL_FORCE)).duration
     found = solved(drive_method, x, 16)
     assert (
-        drive_method.paths.fastest_timing(np.append(found.x[:-1], RAIL_FORCE)).duration
+        drive_method.driver.time_candidate(np.append(found.x[:-1], RAIL_FORCE)).duration
         < 0.9 * begun
     )
     # The slide's values are used, not only the box's path.

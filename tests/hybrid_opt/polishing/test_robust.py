@@ -150,10 +150,10 @@ def test_a_point_is_driven_faster_within_robust_forces_and_believed() -> None:
     drive_method = drive_method_of(Polisher(evaluator, PolishSettings(), functions()))
     driver = evaluator.driver
     assert driver is not None
-    assert 60.0 < drive_method.paths.force_limit[0] < 63.0
+    assert 60.0 < drive_method.force_limit[0] < 63.0
     begin = start_in(cell, force, 0)
     solution = solved(drive_method, begin, 24)
-    before, after = (driver.time_candidate(each)[0] for each in (begin, solution.x))
+    before, after = (driver.time_candidate(each).timing for each in (begin, solution.x))
     assert after.duration < 0.8 * before.duration
     assert after.robust_force is not None
     assert after.robust_force.max() == pytest.approx(force, rel=2e-4)

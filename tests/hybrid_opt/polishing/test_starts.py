@@ -135,7 +135,7 @@ def test_cells_without_a_plane_have_no_image() -> None:
 
 
 def test_each_is_driven_and_turned_about_one_axis_by_one_share() -> None:
-    task, judge, path = drivable_rack().task, drive_method().paths, start(FORCE)[:-1]
+    task, judge, path = drivable_rack().task, drive_method().driver, start(FORCE)[:-1]
     found = rotated_starts(task, path, lambda paths: judge.durations(paths, FORCE))
     assert np.isfinite(judge.durations(np.array(found), FORCE)).all()
     columns, senses = task.free_entries[1], set()
@@ -155,5 +155,5 @@ def test_each_is_driven_and_turned_about_one_axis_by_one_share() -> None:
 
 
 def test_a_path_that_nothing_can_drive_has_no_turned_ones() -> None:
-    task, judge = drivable_rack().task, drive_method().paths
+    task, judge = drivable_rack().task, drive_method().driver
     assert rotated_starts(task, start(FORCE)[:-1], lambda paths: judge.durations(paths, 1.0)) == []

@@ -164,7 +164,7 @@ def test_a_drivable_carry_is_timed_as_the_search_found_it() -> None:
     driver = evaluator().driver
     assert driver is not None
     for x in candidates(3):
-        timing, (found, _) = drivable_timing(model, x), driver.time_candidate(x)
+        timing, found = drivable_timing(model, x), driver.time_candidate(x).timing
         assert timing.ok
         assert timing.duration == pytest.approx(found.duration, rel=1e-9)
         assert timing.driven.normal_force.max() <= 1.005 * x[-1]

@@ -161,7 +161,9 @@ def test_limits_that_the_passes_do_not_support_are_timed_by_toppra(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     limits, less = TimingLimits(force=1.05 * STATIC), TimingLimits(force=0.5 * STATIC)
-    compiled, still = timer_of(hand_cell(), 30).time_all(np.array([initial()] * 2), [limits, less])
+    compiled, still = timer_of(hand_cell(), 30).time_all(
+        np.array([initial()] * 2), limits, np.array([1.05, 0.5]) * STATIC
+    )
     monkeypatch.setattr(ForwardBackwardPasses, "supports", lambda *_: False)
     timer = timer_of(hand_cell(), 30)
     assert not timer.passes.supports(limits)

@@ -23,6 +23,7 @@ from hybrid_opt.timing.robustness import (
     robustness_margins,
 )
 from hybrid_opt.timing.solve import check_limits, drive_path, time_path
+from symbolic.contact.registry import command_model
 from symbolic.records import Uncertainty, Workcell
 from tests.hybrid_opt.timing import convex_oracle
 from tests.hybrid_opt.timing.cells import hand_timing, initial, near_initial, timing_of
@@ -105,7 +106,8 @@ def test_they_agree_with_time_path_and_keep_the_limit_on_the_tenfold_grid() -> N
     model = unsure(FINE)
     paths = np.vstack([initial(), near_initial(np.random.default_rng(3), 2)])
     limits = [TimingLimits(force=force, robust=True) for force in (70.0, 77.0, 83.0)]
-    for x, limit, found in zip(paths, limits, timer().time_all(paths, limits), strict=True):
+    timed = timer().time_all(paths, limits[0], np.array([limit.force for limit in limits]))
+    for x, limit, found in zip(paths, limits, timed, strict=True):
         expected = time_path(model, x, limit)
         assert found.ok, (found.status, expected.reason)
         assert found.duration == pytest.approx(expected.duration, rel=1e-3)
@@ -124,7 +126,7 @@ def test_they_agree_with_a_convex_program() -> None:
     cell, intervals = unsure_cell(some), 24
     model, other = timing_of(cell, intervals), timer_of(some, intervals)
     limits = TimingLimits(force=80.0, torque=False, pressure=False, robust=True)
-    cases = list(worst_cases(cell, some))
+    cases = list(worst_cases(command_model(cell), some))
     assert len(cases) == 4
     exact = convex_oracle.shortest_duration(
         model, initial(), limits, robust_limit(cases, 0.95 / 1.05)
@@ -148,7 +150,8 @@ def test_one_nominal_case_changes_nothing() -> None:
 def test_what_cannot_stand_still_says_with_what_force_it_could() -> None:
     weak, strong = timer().time_all(
         np.array([initial(), initial()]),
-        [TimingLimits(force=force, robust=True) for force in (55.0, 70.0)],
+        TimingLimits(force=55.0, robust=True),
+        np.array([55.0, 70.0]),
     )
     assert strong.ok
     assert weak.status is TimingStatus.INFEASIBLE_AT_REST

@@ -9,8 +9,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid_opt.polishing.native import native
 from hybrid_opt.polishing.solvers import quadratic
+from hybrid_opt.polishing.solvers.base import native
 from hybrid_opt.polishing.solvers.quadratic import (
     BorderedMatrix,
     BorderedRows,
