@@ -33,24 +33,23 @@ Stretch = tuple[slice, int]
 
 @dataclass(frozen=True)
 class PlacedCarry:
-    """A candidate at m places.
+    """A candidate evaluated at m places along the path.
 
     Attributes:
         waypoints: (n_waypoints, 6 + m) extended waypoints [m, rad].
-        pose, rate: (m, 6) box poses [m, rad], and their first derivative by the path parameter.
-        q: joint positions of both arms, (m, n) each [rad]; undefined from `reached` on.
-        reached: places before the first one out of an arm's reach.
-        unreachable_arms: arms that do not reach all places.
-        manipulability: (reached, 2) |det J| over its least value.
-        split: (n, 2) on samples: components of the normal forces, see `symbolic.smooth.samples`: of
-            soft fingers the forces themselves, otherwise normal component and tangential magnitude
-            of the required force [N]; undefined if the pads do not face one another, and in
-            drivable cells.
-        force: (n, 2) on samples: minimised normal forces, planned or robust [N].
-        peak: (2,) their peaks over the reference forces.
-        shift: (n, 2) on samples: shifts of the centres of pressure over the patch radii.
-        distances: of every active pair at the places within reach.
-        gaps: function of a separable pair to its gaps (reached, SEPARATING_DIRECTIONS) [m].
+        pose, rate: (m, 6) box poses [m, rad] and their first derivative by the path parameter.
+        q: (m, n) joint positions of each arm [rad]; undefined from place `reached` on.
+        reached: number of places before the first one out of an arm's reach.
+        unreachable_arms: indices of the arms that do not reach all places.
+        manipulability: (reached, 2) |det J| over its least allowed value.
+        split: (n, 2) at samples: for soft fingers both normal forces, else normal component and
+            tangential magnitude of the required force [N]; undefined in drivable cells and if the
+            pads do not face each other.
+        force: (n, 2) at samples: the normal forces that are minimised, planned or robust [N].
+        peak: (2,) largest of these forces over the reference forces.
+        shift: (n, 2) at samples: shifts of the centres of pressure over the patch radii.
+        distances: distances of all active pairs at the places within reach.
+        gaps: function from a separable pair to its gaps (reached, SEPARATING_DIRECTIONS) [m].
     """
 
     waypoints: Array
@@ -116,19 +115,22 @@ class Distances:
     """Distances between the bodies of one candidate. Each is measured on first use and stored.
 
     Attributes:
-        bounds, interpolated_clearance: (n, n_pairs) lower bounds [m], without and with interpolated
-            minima.
+        bounds: (n, n_pairs) lower bounds of the distances [m].
+        interpolated_clearance: (n, n_pairs) the same bounds, lowered to their minima between places
+            [m].
     """
 
     def __init__(
         self, bounds: Array, measure: Callable[..., object], configuration: Sequence[NDArray[Any]]
     ) -> None:
-        """Interpolate the minima.
+        """Interpolate the minima of the bounds; no distance is measured yet.
 
         Args:
-            bounds: (n, n_pairs) lower bounds [m].
-            measure: raises bounds in place; see `CollisionChecker.measure`.
-            configuration: arrays (n, ...) of the n places, the first arguments of `measure`.
+            bounds: (n, n_pairs) lower bounds of the distances [m].
+            measure: function that raises bounds in place to measured distances, see
+                `CollisionChecker.measure`.
+            configuration: arrays (n, ...) that describe the n places, the first arguments of
+                `measure`.
         """
         near = bounds.min(axis=0, initial=np.inf) < MINIMA_BELOW
         self.bounds, self.interpolated_clearance = bounds, bounds.copy()
@@ -138,8 +140,8 @@ class Distances:
         self._unmeasured = np.ones(bounds.shape, dtype=np.bool_)
 
     def at(self, wanted: NDArray[np.bool_]) -> Array:
-        """Return distances (n, n_pairs) [m]: measured by FCL where wanted, else
-        `interpolated_clearance`."""
+        """Return (n, n_pairs) distances measured by FCL where `wanted` is True, else values of
+        `interpolated_clearance` [m]."""
         self._measure_pairs(*(wanted & self._unmeasured).nonzero())
         return self._values
 

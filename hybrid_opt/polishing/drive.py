@@ -53,8 +53,8 @@ from symbolic.records import Workcell
 from symbolic.records.task import initial_decision, waypoints_of
 
 FIRST_DRIVE_RADIUS, LEAST_DRIVE_RADIUS = 0.3, 1e-4
-"""Radii of the trust region [half ranges of the waypoints]: the first, and the one below which a
-solve ends."""
+"""First radius of the trust region, and radius below which a solve ends [half ranges of the
+waypoints]."""
 
 STATIONARITY_TOLERANCE, FEASIBILITY_TOLERANCE = 1e-4, 5e-3
 """Residuals below which a point counts as optimal: of stationarity and complementarity, and of
@@ -101,14 +101,14 @@ REST_FORCE_MARGIN = 1e-3
 
 
 def is_polishable(workcell: Workcell, robust: bool) -> bool:
-    """Return True if drivable carries of a cell can be polished: if robust forces are limited, it
-    needs two pads with opposite normals."""
+    """Return True if drivable carries of a cell can be polished. If `robust` forces are limited,
+    the cell needs two pads with opposite normals."""
     return command_model(workcell).has_scalar_squeeze or not robust
 
 
 def force_range(driver: CandidateDriver) -> tuple[float, float]:
-    """Return the task's least and largest force limit [N]; the least robust one at least holds the
-    box at both ends of every path."""
+    """Return the least and the largest force limit of the task [N]. A least limit of robust forces
+    is raised if needed to hold the box at both ends of every path."""
     workcell = driver.timer.workcell
     least, most = workcell.task.force_limit
     if driver.robust:
@@ -159,14 +159,16 @@ class _StepAnswer:
 
 
 class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
-    """Minimise the duration within the force limit of the start. A resource: one per process.
+    """Step method that minimises the duration of a drivable carry within the force limit of the
+    start. Create one per process, because it loads functions.
 
     Attributes:
-        driver: times candidates and paths.
+        driver: computes timings of candidates and paths.
         force_limit: least and largest force limit [N].
         hand_made: (n_path,) path of the hand-made trajectory.
-        coarse: the same method in the waypoints of the file, which the intermediate ones follow;
-            itself without intermediate ones. Fewer variables need fewer and cheaper iterations.
+        coarse: the same method that moves only the waypoints of the workcell file, which
+            intermediate waypoints follow. Fewer variables need fewer and cheaper iterations.
+            Without intermediate waypoints it is this object itself.
     """
 
     least_radius, extrapolation = LEAST_DRIVE_RADIUS, DRIVE_EXTRAPOLATION
@@ -209,7 +211,7 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
             self.coarse = DriveStepMethod(cell, is_coarse=True)
 
     def evaluate(self, x: Array) -> DriveIterate:
-        """Evaluate a candidate and its fastest timing."""
+        """Evaluate a decision vector (n_var,) with its fastest timing."""
         timed = self.driver.time_candidate(x)
         return self._iterate(x, timed, timed.squared, np.inf)
 
@@ -228,8 +230,8 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         return np.append(np.clip(moved, task.lower[:n], task.upper[:n]), x[n:])
 
     def evaluate_step(self, best: DriveIterate, step: DriveStep) -> StepEvaluation[DriveIterate]:
-        """Evaluate a step by its timing; rounding may hide a small gain, but must not
-        accumulate."""
+        """Evaluate a step by the timing of the resulting path. A gain that rounding may hide is
+        accepted, unless the losses accumulate."""
         tiny = step.gain <= TIMING_NOISE
         for fraction in DRIVE_BACKTRACKING:
             x = self._moved(best.x, fraction * step.d)
@@ -257,7 +259,8 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
     def evaluate_fraction(
         self, begin: DriveIterate, best: DriveIterate, step: DriveStep, share: float
     ) -> DriveIterate | None:
-        """Evaluate a fraction of a step; see `StepMethod`."""
+        """Return the iterate after a fraction of a step from `begin`; None if it does not improve
+        on the best iterate."""
         x = self._moved(begin.x, share * step.d)
         timed = self.driver.time_candidate(x)
         if timed.duration >= best.level * (1.0 - TIMING_NOISE):
@@ -267,7 +270,8 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
     def propose_step(
         self, best: DriveIterate, required: Mapping[Row, float], radius: float
     ) -> DriveStep | None:
-        """Solve the quadratic model of path and timing about the best iterate."""
+        """Return the step that solves the quadratic model of path and timing about the best
+        iterate, within a box of this radius; None if the model has no solution."""
         grid = self._intervals
         values = IntervalValues(
             grid, self.cell.functions, best.carry.waypoints, best.squared, best.joints

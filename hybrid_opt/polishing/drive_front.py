@@ -29,7 +29,7 @@ from symbolic.array import Array
 from symbolic.path.pieces import coarse_task, resample_decisions
 
 LEAST_GAP = 0.02
-"""Narrower gaps are left [front's extent]."""
+"""Gaps narrower than this are not filled [front's extent]."""
 
 COMPARED_LIMITS = 8
 """Number of force limits at which known paths that are not on the front are compared."""
@@ -89,7 +89,9 @@ def recheck_timing(driver: CandidateDriver, model: TimingModel, x: Array) -> str
     reason if it fails, else ''.
 
     Args:
-        model: of the driver's workcell and intervals.
+        driver: computes timings of candidates.
+        model: timing model of the driver's workcell and intervals.
+        x: decision vector.
     """
     timing = driver.time_candidate(np.asarray(x)).timing
     if not timing.ok:
@@ -114,8 +116,12 @@ class DriveRun(PolishRun[DriveAttempt]):
         """Collect the known paths.
 
         Args:
-            timings: recomputes timings on the finer grid; see `recheck_timing`.
-            paths: (m, n_path) known paths that are not on the front.
+            drive_method: step method of drivable carries.
+            settings: settings of the polish.
+            timings: timing model with which `recheck_timing` checks results.
+            archive: the front to be polished.
+            on_progress: function that is called with the attempts done and the expected total.
+            paths: (m, n_path) further known paths, which are not on the front.
         """
         super().__init__(drive_method.cell.evaluator, settings, archive, on_progress)
         self._most_attempts = MOST_DRIVE_ATTEMPTS
@@ -137,8 +143,8 @@ class DriveRun(PolishRun[DriveAttempt]):
         self._still = self._least / (1.0 + REST_FORCE_MARGIN)
 
     def attempts(self, rng: np.random.Generator) -> Iterator[DriveAttempt]:
-        """Polish one path by the waypoints of the file, sweep the force limits with all, then fill
-        gaps."""
+        """Yield the attempts: polish one path by the waypoints of the file, continue it to all
+        force limits with all waypoints, then fill gaps."""
         forces = map(self._used_force, self._archive.front_indices())
         fast = min((1.0 + LAST_SWEEP_MARGIN) * self._still, self._range[1])
         self._largest = max(*forces, fast, self._least)
@@ -169,14 +175,14 @@ class DriveRun(PolishRun[DriveAttempt]):
         yield from self._gaps()
 
     def _attempt(self, path: Array, force: float, moves: Literal["stated", "all"]) -> DriveAttempt:
-        """Return the attempt at a force limit from a path (n_path,)."""
+        """Return the attempt that starts from a path (n_path,) at a force limit [N]."""
         x = np.append(path, force)
         return DriveAttempt("gap", -1, x, self._evaluator.evaluate(x).objectives[0], moves)
 
     def _rotated(self, force: float) -> list[Array]:
-        """Rotate the best known path and the hand-made one in every direction by the waypoints of
-        the file. Where pads choose their pressure, tilting is free within the patches and decides
-        the basin."""
+        """Return starts in which the best known path and the hand-made one are rotated in every
+        direction at the waypoints of the file. If pads choose their pressure, tilting is free
+        within the patches and decides which basin a solve ends in."""
         paths, durations = self._known_paths(force)
         best = paths[int(np.argmin(durations))]
         task, own = self._method.cell.task, coarse_task(self._method.cell.task)
@@ -197,14 +203,14 @@ class DriveRun(PolishRun[DriveAttempt]):
         return min(float(self._archive.x[index][-1]), share * self._reference)
 
     def _intermediate_force(self, first: float, second: float) -> float:
-        """Return the force limit between two [N]: durations depend on the square root of the force
-        above rest."""
+        """Return a force limit between two others [N]: the geometric mean of the forces above rest,
+        because durations depend on the square root of the force above rest."""
         above = np.sqrt((first - self._still) * (second - self._still))
         return float(self._still + above)
 
     def _gaps(self) -> Iterator[DriveAttempt]:
-        """Yield points of known paths at both ends of the front, then of interpolated paths in its
-        widest gaps."""
+        """Yield attempts for the ends of the front from known paths, then for its widest gaps from
+        interpolated paths."""
         members = self._settings.drivable.members
         for ahead, force in ((FRONT_ENDS, self._least), (FRONT_ENDS - 1, self._largest)):
             self._announce(ahead + members)
@@ -219,8 +225,8 @@ class DriveRun(PolishRun[DriveAttempt]):
             yield from self._fastest(np.vstack([between, self._others]), gap.force)
 
     def _fastest(self, paths: Array, force: float) -> Iterator[DriveAttempt]:
-        """Yield the fastest of some paths (n, n_path) within a force limit, until one is
-        accepted."""
+        """Yield attempts with paths (n, n_path) at a force limit, the fastest path first, until one
+        is accepted."""
         self._tried.add(force)
         durations = self._driver.durations(paths, force)
         for k in np.argsort(durations, kind="stable")[:MOST_PATHS_TRIED]:
@@ -246,8 +252,9 @@ class DriveRun(PolishRun[DriveAttempt]):
         return np.asarray(paths[np.unique(np.argmin(durations, axis=1))])
 
     def _limits(self, least: float, fast: float, count: int) -> list[float]:
-        """Return `count` force limits from one to another [N], continued in equal steps to the
-        front's largest, geometric in the force above rest, which decides the duration."""
+        """Return force limits [N]: `count` from `least` to `fast`, continued with the same ratio to
+        the largest one of the front. The force above rest, which decides the duration, grows
+        geometrically."""
         low, high, most = np.array([least, fast, self._largest]) - self._still
         step = np.log(high / low) / max(count - 1, 1)
         if most > high and step > 0.0:
@@ -257,13 +264,14 @@ class DriveRun(PolishRun[DriveAttempt]):
         return sorted(set(limits))
 
     def _known_paths(self, force: float) -> tuple[Array, Array]:
-        """Return known paths (n, n_path) and their durations within a force limit."""
+        """Return all known paths (n, n_path) and their durations (n,) within a force limit [s]."""
         known = [self._archive.x[k][: self._n_path] for k in self._archive.front_indices()]
         paths = np.unique(np.vstack([*known, self._others]), axis=0)
         return paths, self._driver.durations(paths, force)
 
     def _widest_gap(self) -> DriveGap | None:
-        """Return the largest gap between neighbours with an untried middle; None without any."""
+        """Return the widest gap between neighbours on the front whose middle was not tried yet,
+        None if there is none."""
         # What is not polished yet fills no gap: it is to be improved.
         rows = [k for k in self._archive.front_indices() if self._archive.polished[k]]
         if len(rows) < 2:

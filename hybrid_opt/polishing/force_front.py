@@ -174,7 +174,7 @@ def probe_attempt(start: Start, objective: int | None) -> ForceAttempt:
 
 
 def better_half(reached: list[Start], objective: int | None) -> list[Start]:
-    """Return the better half of the starts, the best first; none of the last."""
+    """Return the better half of the starts, the best first; none if there is only one."""
     ranked = sorted(reached, key=lambda start: start.value(objective))
     return ranked[: len(reached) // 2]
 
@@ -347,9 +347,9 @@ class ForceRun(PolishRun[ForceAttempt]):
         return found
 
     def attempts(self, rng: np.random.Generator) -> Iterator[ForceAttempt]:
-        """Yield the front's points, then probes far from it, then ends and middle in turns while
-        attempts last, then gaps. Mirror images are added throughout, and certified together with
-        points on chords in the end."""
+        """Yield the attempts: at points of the front, then probes far from it, then at ends and
+        middle in turns, then in gaps. Mirror images of results are added at once; they and points
+        on chords are certified in the end."""
         first, fill = front_attempts(self._archive, self._settings), self._settings.fill
         self._ahead = max(self._attempts_left() - len(first), 0)
         aims = (0, 1, None) if self._mirror is None else (0, None)
@@ -377,8 +377,8 @@ class ForceRun(PolishRun[ForceAttempt]):
             self._certify_unproven()
 
     def _probes(self, objective: int | None, rng: np.random.Generator) -> Iterator[ForceAttempt]:
-        """Yield short solves from random feasible candidates and from the front's best point, then
-        from the better half of the results, until one is left (successive halving)."""
+        """Yield short solves from random feasible candidates and from the best point, then from the
+        better half of their results, until one is left (successive halving)."""
         count = self._starts(objective)
         if not count:
             return
@@ -398,7 +398,8 @@ class ForceRun(PolishRun[ForceAttempt]):
             pool = better_half(reached, objective)
 
     def _starts(self, objective: int | None) -> int:
-        """Return the number of starts of short solves: at most twice the attempts ahead."""
+        """Return the number of starts of short solves, at most twice the number of remaining
+        attempts."""
         probe = self._settings.probe
         count = probe.starts if self._mirror is not None else (probe.starts + 1) // 2
         return min(2 * self._ahead, probe.middle_starts if objective is None else count)
@@ -438,8 +439,8 @@ class ForceRun(PolishRun[ForceAttempt]):
         return gaps(self._archive)[place - 1].width > FAR_GAP
 
     def _gaps(self, solved: int) -> Iterator[ForceAttempt]:
-        """Yield attempts in gaps until the front is complete or no side of a gap is left; then add
-        points on chords."""
+        """Yield attempts in gaps until the front is complete or all sides of gaps were tried; then
+        add points on chords."""
         tried: set[Edge] = set()
         self._most_attempts += self._settings.fill.attempts * self._settings.attempts
         while self._attempts_left() > 0:
@@ -538,7 +539,7 @@ class ForceRun(PolishRun[ForceAttempt]):
     def _ends(
         self, objectives: tuple[int | None, ...], rng: np.random.Generator
     ) -> Iterator[ForceAttempt]:
-        """Yield one attempt per objective, and count those without progress."""
+        """Yield one attempt per objective, and count attempts without progress."""
         perturb = partial(perturb_start, self._evaluator, rng=rng)
         for objective in objectives:
             before, stalls = self._archive.best(objective)[1], self._stalls[objective]

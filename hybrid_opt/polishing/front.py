@@ -35,11 +35,11 @@ IMPROVEMENT_TOLERANCE = 1e-6
 """Largest improvement of an objective with which a point still counts as unimproved."""
 
 OPTIMAL_STATIONARITY = 1e-3
-"""Stationarity residual below which a point without improvement counts as optimal."""
+"""Stationarity residual below which an unimproved point counts as optimal."""
 
 
 class ParetoArchive:
-    """Points of a front during its polish: rows of the given front, and new ones."""
+    """Points of a front during its polish: those of the given front, and new ones."""
 
     def __init__(self, x: Array, objectives: Array, parent: list[int]) -> None:
         self.x, self.objectives = list(x), list(objectives)
@@ -89,7 +89,7 @@ class ParetoArchive:
 
 @dataclass(frozen=True)
 class Attempt:
-    """One attempt.
+    """One attempt to improve a front.
 
     Attributes:
         aim, parent, start: as in `hybrid_opt.polishing.records.PolishOutcome`.
@@ -126,7 +126,7 @@ class PolishRun(ABC, Generic[AnyAttempt]):
 
     @abstractmethod
     def attempts(self, rng: np.random.Generator) -> Iterator[AnyAttempt]:
-        """Yield attempts; each one is recorded before the next one is requested."""
+        """Yield the attempts. The result of each is recorded before the next one is requested."""
 
     @abstractmethod
     def _solve(self, attempt: AnyAttempt) -> Solution:
@@ -136,10 +136,11 @@ class PolishRun(ABC, Generic[AnyAttempt]):
     def _classify(
         self, attempt: AnyAttempt, answer: Solution, objectives: Array
     ) -> tuple[Status, str, Array]:
-        """Return the status of a feasible answer: accepted, optimal or rejected."""
+        """Return the result of a feasible answer: its status (accepted, optimal or rejected), the
+        reason and the objectives."""
 
     def run(self, rng: np.random.Generator) -> None:
-        """Solve, verify and record attempts while any are left."""
+        """Solve, check and record attempts as long as there are any."""
         for attempt in self.attempts(rng):
             if self._attempts_left() <= 0:
                 continue
@@ -171,7 +172,7 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         return self._most_attempts - len(self.outcomes)
 
     def _announce(self, attempts: int) -> None:
-        """Report the expected number of further attempts."""
+        """Report that this many further attempts are expected."""
         self._expected = attempts
         self._on_progress(len(self.outcomes), len(self.outcomes) + attempts)
 
@@ -185,8 +186,8 @@ class PolishRun(ABC, Generic[AnyAttempt]):
             self._archive.add(outcome.x, outcome.objectives)
 
     def _status(self, attempt: AnyAttempt, answer: Solution) -> tuple[Status, str, Array]:
-        """Return the status of an answer, its reason and its objectives, after full evaluation and
-        certification between the samples."""
+        """Evaluate an answer in full and certify it between the samples. Return its status, the
+        reason and the objectives."""
         if not answer.usable:
             return "failed", answer.message, attempt.start
         # An answer without any iteration is a point to verify as it is.
@@ -199,7 +200,7 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         return self._classify(attempt, answer, found.objectives[0])
 
     def _evaluate(self, attempt: AnyAttempt, x: Array) -> Evaluations:
-        """Evaluate x (n_var,) in full and certify it between the samples."""
+        """Evaluate x (n_var,) by the full model and certify it between the samples."""
         return self._evaluator.certified(self._evaluator.evaluate(x))
 
     def _not_improved(self, answer: Solution, attempt: AnyAttempt) -> tuple[Status, str, Array]:

@@ -160,8 +160,8 @@ class IntervalGrid:
         return np.asarray(by_path @ self.spread)
 
     def path(self, waypoints: Array) -> tuple[Array, Array, Array]:
-        """Return the extended pose and both derivatives (intervals + 1, 6 + m) of extended
-        waypoints (n_waypoints, 6 + m)."""
+        """Return the extended pose and its two derivatives (intervals + 1, 6 + m) at the grid
+        points for extended waypoints (n_waypoints, 6 + m)."""
         first, second, third = (np.ascontiguousarray(b @ waypoints) for b in self._bases)
         return first, second, third
 
@@ -183,12 +183,14 @@ class IntervalValues:
         squared: Array,
         near: tuple[Array, Array],
     ) -> None:
-        """Evaluate.
+        """Evaluate the quantities.
 
         Args:
+            grid: shared data.
+            functions: compiled functions of the polish.
             waypoints: (n_waypoints, 6 + m) extended waypoints.
             squared: (intervals + 1,) u'^2 at the grid points.
-            near: joints of both arms (intervals + 1, n) near those that hold the box.
+            near: (intervals + 1, n) for each arm, joint positions near those that hold the box.
         """
         self._grid, self._functions = grid, functions
         path, s, threads = grid.path(waypoints), grid.sample, grid.threads

@@ -317,7 +317,7 @@ class TrustRegionSolve(Generic[AnyIterate, AnyStep]):
         return solution
 
     def _iterate(self) -> None:
-        """Propose a step, evaluate it, and accept or reject the candidate that it leads to."""
+        """Propose a step, evaluate it, and accept or reject the candidate after it."""
         method, best, region = self._method, self.best, self._region
         is_relaxed, self._is_relaxed = (
             self._is_relaxed,

@@ -247,7 +247,8 @@ class ConstraintRows:
         }
 
     def _lay_out_places(self, layout: RowLayout, q: tuple[Array, Array]) -> dict[str, Any]:
-        """Sort rows at places by their function; the joints of every place are solved once."""
+        """Group the rows at places by their functions. The joints of each place are solved for
+        once."""
         cell, rows = self._cell, layout.place_rows
         members: dict[NumericFunction, list[int]] = {}
         for k, row in enumerate(rows):

@@ -518,10 +518,15 @@ class JerkProgram:
 
 
 def _add_linearised(at: WarpedPath, c: Array, value: Array, by: Array, rows: JerkProgram) -> None:
-    """Add rows value + by (c_new - c) <= 1 for values (n, m) over their limits with derivatives
-    `by` (n, m, k).
+    """Add rows that limit values, linearised at c, to one: value + by (c_new - c) <= 1. A value
+    that exceeds one at c gets a row that allows the same excess.
 
-    A value above one at c gets a row that still allows this excess once.
+    Args:
+        at: samples of the path.
+        c: (k,) coefficients.
+        value: (n, m) values over their limits at c.
+        by: (n, m, k) derivatives of the values.
+        rows: program that gets the rows.
     """
     bound = np.maximum(at.keep[:, None], value) - value + by @ c
     A = at.local(by)

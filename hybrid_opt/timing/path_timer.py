@@ -240,7 +240,13 @@ class CandidateDriver:
     """
 
     def __init__(self, timer: PathTimer, threads: int = 1, robust: bool = False) -> None:
-        """Use a path timer. `threads` threads share a batch of candidates."""
+        """Store a path timer.
+
+        Args:
+            timer: computes the timings.
+            threads: number of threads that share a batch of candidates.
+            robust: whether force limits apply to robust forces.
+        """
         self._task = timer.workcell.task
         self._threads = threads
         self.timer, self.robust = timer, robust

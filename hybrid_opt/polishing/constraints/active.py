@@ -114,8 +114,8 @@ class RowSelector:
     def required_values(
         self, carry: PlacedCarry, rows: Iterable[Row], is_relaxed: bool = False
     ) -> dict[Row, float]:
-        """Return the value that each row has to exceed, computed at a candidate by the kind of the
-        row."""
+        """Return the value that each row has to exceed. The kind of the row computes it from a
+        candidate, for example from the distances there."""
         values: dict[Row, float] = {}
         for kind, own in self._by_kind(rows).items():
             values.update(zip(own, kind.required_values(carry, own, is_relaxed), strict=True))
