@@ -252,12 +252,13 @@ class Grasp:
     def result(
         self, wrenches: list[ca.SX], sizes: list[ca.SX]
     ) -> tuple[ca.SX, ca.SX | ca.DM | float]:
-        """Return all pads' wrenches over the load's scale, and the value that replaces them if
-        there is no solution.
+        """Return the wrenches of all pads in units of the load's scale, and the value that replaces
+        them if friction does not close the grasp.
 
         Args:
-            wrenches: scaled wrenches.
-            sizes: those of `SCALING_INPUTS` that are inputs.
+            wrenches: wrenches of all pads, scaled by friction and patch sizes.
+            sizes: the inputs of the function that are listed in `SCALING_INPUTS`: friction
+                coefficients, and the sizes of the patches if they are inputs.
         """
         whole = [full_wrench(self.units(i, *sizes) * own) for i, own in enumerate(wrenches)]
         beyond = ca.DM([BEYOND, 0, 0, 0, 0, 0])

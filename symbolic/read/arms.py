@@ -221,7 +221,8 @@ def reduced_model(urdf: Urdf, held: Positions = ()) -> pin.Model:
 
 @lru_cache(maxsize=16)
 def _reduced(kinematics: str, file: str, held: Positions) -> pin.Model:
-    """Build the model of `reduced_model`; cached, so callers must not modify it."""
+    """Return the Pinocchio model of a URDF with some joints held. The result is cached, so callers
+    must not modify it."""
     try:
         model = pin.buildModelFromXML(kinematics)
     except (ValueError, RuntimeError, IndexError) as error:

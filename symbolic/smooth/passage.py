@@ -74,14 +74,15 @@ def direction_numbers(obstacle: Array, k: int) -> Array:
 
 
 def direction(place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-    """Return a direction (3,), not normalised, as the sum of three terms of which one is nonzero: a
-    fixed vector, a vector of the payload, and the cross product of a fixed edge and an edge of the
-    payload.
+    """Return a separating direction (3,), not normalised: an axis of the obstacle, an axis of the
+    payload, or the cross product of an edge of each. It is the sum of all three terms, of which two
+    are zero.
 
     Args:
-        place: symbols of the place.
-        numbers: (DIRECTION_NUMBERS,) these four vectors, the fixed ones in the world frame, the
-            others in the payload's axes.
+        place: symbols of the place of the path.
+        numbers: (DIRECTION_NUMBERS,) four vectors: the obstacle's axis and the payload's axis, then
+            the obstacle's edge and the payload's edge. Those of the obstacle are in the world
+            frame, those of the payload along the payload's axes.
     """
     fixed, own, edge, other = ca.vertsplit(numbers, 3)
     turned = ca.mtimes(place.rotation, ca.horzcat(own, other))
