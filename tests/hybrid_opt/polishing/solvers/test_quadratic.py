@@ -99,7 +99,7 @@ def fresh_native() -> Iterator[None]:
 @pytest.mark.usefixtures("fresh_native")
 def test_a_missing_module_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "hybrid_opt.polishing._native", None)
-    with refused(BridgeError, "bridge", "pip install -e ."):
+    with refused(BridgeError, "not-loadable", "pip install -e ."):
         solve_quadratic(program(1))
 
 
