@@ -259,6 +259,16 @@ class Job:
         reach = self.robots[arm]["reach"]
         return float(sum(r * abs(v) for r, v in zip(reach, rates, strict=True)))
 
+    def _project(self, arm: int, q: Sequence[float], s: float) -> float:
+        """Fit the coordinate of an arm that is on its path by one step of Gauss and Newton [s]."""
+        planned, rates = self.position(arm, s), self.linear(arm, "velocity", s)
+        rows = zip(self.robots[arm]["reach"], q, planned, rates, strict=True)
+        fit = [(r * r * (a - b) * v, r * r * v * v) for r, a, b, v in rows]
+        speed = sum(square for _, square in fit)
+        if speed == 0.0:
+            return s
+        return float(min(max(s + sum(along for along, _ in fit) / speed, 0.0), self.end))
+
     def coordinate(
         self,
         arm: int,
@@ -275,6 +285,9 @@ class Job:
         """
         if self.distance(arm, q, s) <= near:
             return s
+        close = self._project(arm, q, s)
+        if window[0] <= close - s <= window[1] and self.distance(arm, q, close) <= NEAR:
+            return self._project(arm, q, close)
         best, low, high = s, *window
         for step in (4.0 * SEARCH_STEP, SEARCH_STEP, SEARCH_STEP / 8.0, SEARCH_STEP / 64.0):
             numbers = sorted(range(round(low / step), round(high / step) + 1), key=abs)

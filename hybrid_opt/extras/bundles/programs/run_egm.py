@@ -25,6 +25,7 @@ import struct
 import sys
 import time
 from bisect import bisect_left
+from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -53,6 +54,9 @@ PATIENCE = 30.0
 LONGEST_TICK = 0.02
 """At most so much of the job passes between two messages [s]: a pause of this computer does not
 make the arms jump."""
+
+KEPT = 250
+"""Ticks of the pressing pad that are kept: more than an arm's lag and the largest silence."""
 
 MOST_PRESSED = 1.2
 """Measured over commanded force beyond which the pad goes no farther into the box."""
@@ -122,9 +126,11 @@ class Stream:
         self._arm: int = config["press"]["arm"]
         self._q: list[list[float] | None] = [None, None]
         self._first: list[list[float] | None] = [None, None]
+        self._follows = [False, False]
         self._force: list[float | None] = [None, None]
         self._news = [-math.inf, -math.inf]
         self._last: float | None = None
+        self._ways = deque[tuple[float, float]](maxlen=KEPT)
         # A name that is no address is looked up once, before the stream.
         self._hosts = [socket.gethostbyname(host) for host in config["addresses"]]
         self.dropped = 0
@@ -135,9 +141,10 @@ class Stream:
         q = list(self._q)
         pressing = q[self._arm]
         if pressing is not None:
-            # Where it would be without what it is moved into the box.
+            # Where it would be without what it had been moved into the box when it was measured.
             inward = self._inward(self.machine.clock.s)
-            way = self.press.way
+            then = self._news[self._arm] - self.config["lags"][self._arm]
+            way = next((way for time, way in reversed(self._ways) if time <= then), 0.0)
             q[self._arm] = [a - way * slope for a, slope in zip(pressing, inward, strict=True)]
         lost = self.fault not in ("", CTRL_C)
         force: list[float | None] = [None, None]
@@ -154,12 +161,22 @@ class Stream:
         self._q[arm] = [math.radians(value) for value in degrees]
         self._first[arm] = self._first[arm] or self._q[arm]
         self._news[arm] = now
-        if self.config["sensors"][arm] and len(message.force) >= 3:
+        if self.config["sensors"][arm]:
             # About carryPad, whose z axis is the pad's normal.
-            self._force[arm] = message.force[2]
+            self._force[arm] = message.force[2] if len(message.force) >= 3 else None
+        self._follows[arm] = message.running
         if self.machine.state == "running" and not message.running:
-            name = self.job.robots[arm]["name"]
-            self.fault = self.fault or f"the controller of {name} does not follow"
+            self.fault = self.fault or self._not_following(arm)
+
+    def _not_following(self, arm: int) -> str:
+        return f"the controller of {self.job.robots[arm]['name']} does not follow"
+
+    @property
+    def missing(self) -> str:
+        """Reason why the job cannot begin yet, or ''."""
+        if None in self._q:
+            return "a controller is silent"
+        return "" if all(self._follows) else self._not_following(self._follows.index(False))
 
     def read(self, arm: int, data: bytes, host: str) -> FromRobot | None:
         """Read a packet; drop and count one that another host sent or that is damaged."""
@@ -193,11 +210,17 @@ class Stream:
             if self.machine.state == "running":
                 felt = own if own is not None else other
             self.press.tick(dt, wanted, later, felt)
+            spare = self.job.limits.force * self.job.force(self._arm, self.job.pressed)
+            if felt is not None and clock.s < self.job.pressed and felt > later + spare:
+                # The band begins when the pads hold; arms stiffer than measured show before.
+                name = self.job.robots[self._arm]["name"]
+                self.fault = self.fault or f"{name} presses {felt:.1f} N instead of {wanted:.1f} N"
         elif self.machine.state == "running":
             raw = self._force[self._arm]
             if raw is not None:
                 self.press.creep(dt, wanted, abs(raw - self.looks.offset(self._arm)))
             self.looks.note(now, self.machine, seen, list(self._force), self.press.way)
+        self._ways.append((now, self.press.way))
         if self.machine.state == "held" and self.command in ("continue", "back"):
             direction = 1.0 if self.command == "continue" else -1.0
             self.command = self.fault = ""
@@ -304,35 +327,40 @@ def streamed(
     while stream.machine.state != "done":
         ready, _, _ = select.select(waiting, [], [], 0.01)
         now = time.monotonic()
-        stream.tick(now)
+        heard: dict[int, tuple[FromRobot, Any]] = {}
         for arm, source in enumerate(sockets):
-            if source in ready:
-                data, address = source.recvfrom(4096)
+            # What came while this computer was busy is old: the newest message counts.
+            for data, address in received(source):
                 message = stream.read(arm, data, address[0])
-                if message is None:
-                    continue
-                stream.hear(arm, message, now)
-                source.sendto(stream.answer(arm, message.number, now), address)
+                if message is not None:
+                    stream.hear(arm, message, now)
+                    heard[arm] = message, address
+        stream.tick(now)
+        for arm, (message, address) in heard.items():
+            sockets[arm].sendto(stream.answer(arm, message.number, now), address)
         if sys.stdin in ready:
             line = sys.stdin.readline()
             stream.command = line.strip()
             if not line:
                 waiting.remove(sys.stdin)
-        if (
-            stream.machine.state == "ready"
-            and all(q is not None for q in stream.seen(now).q)
-            and stream.command == word
-        ):
+        if stream.machine.state == "ready" and not stream.missing and stream.command == word:
             stream.machine.start(stream.seen(now))
             if check:
                 print("both arms are at their first places", file=sys.stderr)
                 return 0
         if stream.machine.state == "ready" and not word and now - begin > PATIENCE:
-            raise Refused("a controller is silent: is CarryEgm running in both tasks?")
+            raise Refused(f"{stream.missing}: is CarryEgm running in both tasks?")
         if stream.machine.state == "held" and stream.command == "leave":
             print(f"left while {stream.told()}", file=sys.stderr)
             return 1
     return 0 if stream.machine.clock.s > 0.0 else BACK
+
+
+def received(source: socket.socket) -> Iterator[tuple[bytes, Any]]:
+    """Yield the packets that wait in a socket, with their senders."""
+    with suppress(BlockingIOError):
+        while True:
+            yield source.recvfrom(4096, socket.MSG_DONTWAIT)
 
 
 CORRECTION = 3

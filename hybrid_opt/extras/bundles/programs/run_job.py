@@ -431,7 +431,7 @@ class Run:
         try:
             self.send(moments, self._began)
         except Refused as error:
-            self.node.get_logger().error(f"{error}; the job goes on to its end as planned")
+            self.node.get_logger().error(f"{error}; its arm goes on as it was last told")
 
     def drive(self, part: Job, word: str) -> bool:
         """Drive a part of the job to its end and back, once somebody has said a word."""

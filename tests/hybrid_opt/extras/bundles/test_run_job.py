@@ -16,7 +16,9 @@ from unittest.mock import patch
 import numpy as np
 import pytest
 
+from hybrid_opt.extras.bundles.job_file import pad_errors
 from hybrid_opt.extras.bundles.programs.bring_up import BLOCK, FILE, SPEED
+from hybrid_opt.job.compliance import TRACKED
 from symbolic.array import Array
 from tests.hybrid_opt.extras.bundles import mock_ros
 from tests.hybrid_opt.extras.bundles.bundles import contents
@@ -66,6 +68,19 @@ def test_the_job_is_done(driver: str) -> None:
     assert world.log[-1].startswith("done")
     time, moved = column(world, 0), moves(world)
     assert time[moved[-1]] - time[moved[0]] == pytest.approx(job().end, abs=0.3)
+
+
+@pytest.mark.parametrize("stiffness", [1e4, 3e4, 1e5, 3e5])
+def test_arms_of_stiff_controllers_keep_their_force(stiffness: float) -> None:
+    """What controllers make up between two points changes the gap of the pads, and the force by the
+    stiffness of both arms in series."""
+    world = sound("franka")
+    s = column(world, 0) - column(world, 0)[0] - begins("franka")
+    held = (s > job().pressed) & (s < job().begin("release"))
+    along, _ = pad_errors(rack_job().workcell, column(world, 1)[held])
+    ratio = 1.0 - stiffness / 2.0 * along / [job().force(0, each) for each in s[held]]
+    print(f"{stiffness:g} N/m: {ratio.min():.5f} to {ratio.max():.5f} of the command")
+    assert np.abs(ratio - 1.0).max() < TRACKED
 
 
 def test_a_joint_that_moves_both_arms_is_commanded_once(tmp_path: Path) -> None:
