@@ -135,6 +135,10 @@ def skewed(job: Job, delay: float, stiffness: float) -> Skew:
     """
     require_stiffness(stiffness)
     require_delay(delay)
+    return _worst(job, delay, stiffness)
+
+
+def _worst(job: Job, delay: float, stiffness: float) -> Skew:
     found = [_skewed(job, phase, late, delay, stiffness) for phase in job.held for late in (0, 1)]
     worst = min(found, key=lambda each: each.margin)
     return replace(
@@ -158,19 +162,24 @@ def separation(job: Job, delay: float) -> float:
     )
 
 
-def largest_skew(job: Job, stiffness: float) -> float:
-    """Compute the longest delay of either arm [s] for which friction still holds the box, at most
-    `LARGEST_SKEW`.
+def largest_skew(job: Job, stiffness: float, longest: float = LARGEST_SKEW) -> float:
+    """Compute the longest delay of either arm [s] for which friction still holds the box.
+
+    Args:
+        job: the whole job.
+        stiffness: stiffness of each arm at its pad [N/m].
+        longest: largest delay that is tried, and largest result [s].
 
     Raises:
         SettingsError: the stiffness is not positive.
     """
-    low, high = 0.0, LARGEST_SKEW
-    if skewed(job, high, stiffness).is_held:
+    require_stiffness(stiffness)
+    low, high = 0.0, longest
+    if _worst(job, high, stiffness).is_held:
         return high
     for _ in range(_BISECTIONS):
         middle = (low + high) / 2.0
-        if skewed(job, middle, stiffness).is_held:
+        if _worst(job, middle, stiffness).is_held:
             low = middle
         else:
             high = middle

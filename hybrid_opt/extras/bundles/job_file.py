@@ -312,7 +312,8 @@ class PartnerStop:
     Attributes:
         time: until the other arm has gone as far as it will, at the planned speed [s].
         distance: by which the pads are then apart from their relative place [m].
-        survived: distance at which friction still holds the box; None without a stiffness [m].
+        survived: distance up to which friction holds the box, at most `distance`; None without a
+            stiffness [m].
         allowed: the cell's `handling.partner_stop` [m].
     """
 
@@ -510,6 +511,16 @@ class Export:
             grip=self.workcell.handling.grip_limit,
         )
 
+    @property
+    def _noticed(self) -> float:
+        """Time until a program notices an arm that stands while it holds the box [s]: the pads are
+        as far apart as `skew` makes them at the fastest place of the job, or the arm is `behind`.
+        """
+        speed = np.abs(self.sampled.arm(0, self.sampled.q_rate)) @ self.reach(0)
+        spans = [self.sampled.span(self.job.phases.index(phase)) for phase in self.job.held]
+        held = max(float(speed[span].max()) for span in spans)
+        return min(self.limits.behind, self.limits.skew * float(speed.max()) / held)
+
     @cached_property
     def partner_stop(self) -> PartnerStop:
         """What one arm's stop costs.
@@ -517,10 +528,10 @@ class Export:
         Raises:
             JobError: more than the cell allows.
         """
-        # The other one goes on until both are `skew` apart, then half as far as without a stop.
-        time = self.limits.skew + REACTION + self.stop.quick / 2.0
+        # Half of a stop's time passes at the planned speed.
+        time = self._noticed + REACTION + self.lag + self.stop.quick / 2.0
         job, k = self.job, self.stiffness
-        survived = None if k is None else separation(job, largest_skew(job, k))
+        survived = None if k is None else separation(job, largest_skew(job, k, time))
         allowed = self.workcell.handling.partner_stop
         found = PartnerStop(time, separation(job, time), survived, allowed)
         if allowed is not None and found.distance > allowed:
