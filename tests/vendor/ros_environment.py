@@ -104,6 +104,30 @@ INTERFACES = {
         bool success
         string error
     """,
+    # ros-industrial/ur_msgs 7f73065.
+    "ur_msgs/msg/Analog": """
+        uint8 pin
+        uint8 domain
+        float32 state
+    """,
+    "ur_msgs/msg/Digital": """
+        uint8 pin
+        bool state
+    """,
+    "ur_msgs/msg/IOStates": """
+        Digital[] digital_in_states
+        Digital[] digital_out_states
+        Digital[] flag_states
+        Analog[] analog_in_states
+        Analog[] analog_out_states
+    """,
+    "ur_msgs/srv/SetIO": """
+        int8 fun
+        int8 pin
+        float32 state
+        ---
+        bool success
+    """,
     # ros-industrial/ur_msgs 8bbb686, which has the fields of an Inertia since driver 3.8.
     "ur_msgs/srv/SetPayload": """
         float32 mass
