@@ -66,6 +66,7 @@ class Controllers:
         silent, stands: arms without messages, and arms that do not follow.
         offset: of the sensor [N].
         deaf: nothing is measured.
+        is_empty: nothing stands between the pads.
         stopped: EGM has ended in both controllers.
         late: longest time for which the program's computer is busy with something else [s].
         record: per cycle time since the job began [s], force [N] and both arms' joints [rad].
@@ -77,6 +78,7 @@ class Controllers:
         folder: Path,
         stiffness: float = STIFFNESS,
         before: Sequence[str] = (),
+        arguments: Sequence[str] = (),
     ) -> None:
         """Start the program of a bundle in a folder, at ports that are free.
 
@@ -84,10 +86,11 @@ class Controllers:
             files: of the bundle.
             folder: to write it to.
             before: command that starts the program's interpreter.
+            arguments: of the program.
         """
         from abb_robot_client._egm_protobuf import egm_pb2
 
-        self._egm = egm_pb2
+        self._egm, self.stiffness = egm_pb2, stiffness
         config = json.loads(files["config/egm.json"]) | {"ports": free_ports()}
         write_bundle(folder, as_planned({**files, "config/egm.json": json.dumps(config)}, SIGN), {})
         self.job = Job(json.loads(files["job.json"]))
@@ -100,7 +103,7 @@ class Controllers:
         self.pressing = config["press"]["arm"]
         self._number, self._began = 0, 0.0
         self.silent, self.stands, self.offset = [False, False], [False, False], 0.0
-        self.deaf, self.stopped, self.late = False, False, 0.0
+        self.deaf, self.stopped, self.late, self.is_empty = False, False, 0.0, False
         self._rng, self._busy = random.Random(0), 0.0
         self.record: list[tuple[float, float, Array]] = []
         with suppress(PermissionError):
@@ -108,7 +111,7 @@ class Controllers:
             os.sched_setscheduler(0, os.SCHED_RR | os.SCHED_RESET_ON_FORK, os.sched_param(10))
         self.log = (folder / "log").open("w+", encoding="utf-8")
         self.program = subprocess.Popen(
-            [*before, sys.executable, folder / "run_egm.py"],
+            [*before, sys.executable, folder / "run_egm.py", *arguments],
             stdin=subprocess.PIPE,
             stderr=self.log,
             text=True,
@@ -132,7 +135,7 @@ class Controllers:
                 told.popleft()
             if not self.stands[arm]:
                 self._q[arm] = told[0][1]
-        force = max(0.0, -STIFFNESS / 2.0 * gap(self.q))
+        force = 0.0 if self.is_empty else max(0.0, -self.stiffness / 2.0 * gap(self.q))
         moved = max(
             float(np.abs(q - self.job.position(arm, 0.0)).max()) for arm, q in enumerate(self._q)
         )
