@@ -139,11 +139,17 @@ class Distances:
         self._values = self.interpolated_clearance.copy()
         self._unmeasured = np.ones(bounds.shape, dtype=np.bool_)
 
-    def at(self, wanted: NDArray[np.bool_]) -> Array:
-        """Return (n, n_pairs) distances measured by FCL where `wanted` is True, else values of
-        `interpolated_clearance` [m]."""
-        self._measure_pairs(*(wanted & self._unmeasured).nonzero())
-        return self._values
+    def closer_than(self, limits: Array) -> dict[int, Array]:
+        """Measure the distances below the limits (n_pairs,) of their pairs [m].
+
+        Returns:
+            By pair with any such distance, its distances (n,) [m]: measured below the limit, else
+            `interpolated_clearance`.
+        """
+        close = self.interpolated_clearance < limits
+        self._measure_pairs(*(close & self._unmeasured).nonzero())
+        pairs = np.flatnonzero(close.any(axis=0)).tolist()
+        return {pair: self._values[:, pair].copy() for pair in pairs}
 
     def _measure_pairs(self, places: NDArray[np.intp], pairs: NDArray[np.intp]) -> None:
         if not len(places):

@@ -99,14 +99,6 @@ class DistanceConstraintKind(ConstraintKind[PathRow]):
         values[chosen] = wanted - (truth - smooth)
         return values.tolist()
 
-    def violations(self, carry: PlacedCarry) -> dict[int, Array]:
-        """Return for every pair that is too close its distances (reached,) along the path [m], by
-        the index of the pair."""
-        close = carry.distances.interpolated_clearance < self.least
-        pairs = np.flatnonzero(close.any(axis=0)).tolist()
-        truth = carry.distances.at(close)
-        return {pair: truth[:, pair].copy() for pair in pairs}
-
 
 def pair_of(row: PathRow) -> int:
     """Return the index of the active pair that a distance row belongs to."""
@@ -130,7 +122,7 @@ class Clearances(DistanceConstraintKind):
         """Return rows of the pairs that are too close, at the minimum and around it. An
         interpolated minimum has rows at both neighbouring places."""
         width = self.grid.places(BESIDE_CLEARANCE)
-        for pair, distance in self.violations(carry).items():
+        for pair, distance in carry.distances.closer_than(self.least).items():
             if pair in self.separable:
                 continue
             lows = local_minima_below(distance, float(self.least[pair]))
@@ -253,7 +245,7 @@ def violated_passages(
     """Yield each place at which a separable pair is too close, as the index of the pair, the gaps
     of the known candidate, the place, and the kinks of the known candidate near the place."""
     window = kind.grid.places(KINK_WINDOW)
-    for pair, distance in kind.violations(carry).items():
+    for pair, distance in carry.distances.closer_than(kind.least).items():
         if pair not in kind.separable:
             continue
         gaps = Gaps.from_values(known.gaps(pair))
