@@ -511,16 +511,6 @@ class Export:
             grip=self.workcell.handling.grip_limit,
         )
 
-    @property
-    def _noticed(self) -> float:
-        """Time until a program notices an arm that stands while it holds the box [s]: the pads are
-        as far apart as `skew` makes them at the fastest place of the job, or the arm is `behind`.
-        """
-        speed = np.abs(self.sampled.arm(0, self.sampled.q_rate)) @ self.reach(0)
-        spans = [self.sampled.span(self.job.phases.index(phase)) for phase in self.job.held]
-        held = max(float(speed[span].max()) for span in spans)
-        return min(self.limits.behind, self.limits.skew * float(speed.max()) / held)
-
     @cached_property
     def partner_stop(self) -> PartnerStop:
         """What one arm's stop costs.
@@ -528,8 +518,9 @@ class Export:
         Raises:
             JobError: more than the cell allows.
         """
-        # Half of a stop's time passes at the planned speed.
-        time = self._noticed + REACTION + self.lag + self.stop.quick / 2.0
+        # An arm that stands is noticed where it is `behind`, often sooner by what the arms are
+        # apart; half of a stop's time passes at the planned speed.
+        time = self.limits.behind + REACTION + self.lag + self.stop.quick / 2.0
         job, k = self.job, self.stiffness
         survived = None if k is None else separation(job, largest_skew(job, k, time))
         allowed = self.workcell.handling.partner_stop
