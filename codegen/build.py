@@ -5,6 +5,9 @@ driver, of one that is written by hand, or of a program (`load_or_build_program`
 kept under a key of the text and of what compiles it; long functions in it are parts, object files
 under keys of their own. What sources are made from has a key as well, a recipe's: under it the
 cache holds the keys of the libraries, so that a warm start makes neither expressions nor C.
+
+Functions of scalars in a set that is evaluated in batches may be stored as tapes instead
+(`codegen.tape`): they need no compiler.
 """
 
 from __future__ import annotations
@@ -13,14 +16,14 @@ import ctypes
 import os
 import platform
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from codegen.cache import Cache, CacheEntry, key_of, library_version
 from codegen.compiled import CompiledFunction, cannot_load, warn_one_lane
@@ -37,9 +40,15 @@ from codegen.compiler import (
 from codegen.errors import CodegenError, FormError
 from codegen.function import NumericFunction, Signature, available_cores
 from codegen.parts import CodePart, in_parts
+from codegen.tape import Tape, TapeFunction
 
 if TYPE_CHECKING:
     import casadi as ca
+
+Member = TypeVar("Member", bound="Library | StoredTape")
+
+TAPE_SUFFIX = ".npy"
+"""Suffix of the cache's tapes."""
 
 HANDWRITTEN_LEVEL = 3
 """Optimisation level of what is written by hand: it is short."""
@@ -111,6 +120,23 @@ class Library:
         """
         signature = Signature.from_json(self.entry.facts["signature"])
         return CompiledFunction(signature, self.entry.library, self.handle)
+
+
+@dataclass(frozen=True)
+class StoredTape:
+    """A tape of the cache.
+
+    Attributes:
+        entry: its entry in the cache.
+        tape: its instructions.
+    """
+
+    entry: CacheEntry
+    tape: Tape
+
+    def function(self) -> TapeFunction:
+        """Return the tape as a numeric function."""
+        return TapeFunction(self.tape)
 
 
 @dataclass(frozen=True)
@@ -223,7 +249,8 @@ def build(
     built = _compiled(sources, cache, rebuild=rebuild)
     ordered = {name: built[name] for name in functions}
     if key is not None:
-        _remember(_set_key(key, levels, lanes, cache), ordered, cache)
+        libraries = {name: library for name, (library, _) in ordered.items()}
+        _remember(_set_key(key, levels, lanes, cache), libraries, cache)
     told = ("operations", "c_bytes", "compile_seconds", "level")
     reports, functions, keys = [], {}, {}
     for name, (library, found) in ordered.items():
@@ -240,6 +267,7 @@ def load_or_build(
     *,
     levels: Mapping[str, int] | None = None,
     lanes: int = 1,
+    taped: bool = False,
 ) -> dict[str, NumericFunction]:
     """Load or build a set of functions by the key of their ingredients.
 
@@ -252,14 +280,60 @@ def load_or_build(
         cache: where libraries are kept; by default the user's.
         levels: optimisation level per name, where the default by size is not wanted.
         lanes: evaluations of a batch that run side by side; 0 for what suits the machine.
+        taped: True to store functions of scalars as tapes, and compile the others alone.
 
     Raises:
         CodegenError: see `compile_function`; also the errors of `make`.
+        BridgeError: the module that runs tapes cannot be loaded.
     """
     cache = cache or Cache()
-    full = _set_key(key, levels, lanes, cache)
-    libraries = _obtained(full, lambda: _sources_of(make, levels or {}, lanes), cache)
-    return {name: library.function() for name, library in libraries.items()}
+    full = _set_key(key, levels, lanes, cache, taped)
+
+    def members() -> dict[str, Library | StoredTape]:
+        tapes: dict[str, Library | StoredTape] = {}
+
+        def sources() -> Iterator[CSource]:
+            functions = dict(make())
+            for name in list(functions) if taped else ():
+                if (tape := Tape.of(functions[name])) is not None:
+                    tapes[name] = _taped(tape, cache)
+                    del functions[name]
+            yield from _sources_of(lambda: functions, levels or {}, lanes)
+
+        compiled = _compiled(sources(), cache)
+        return tapes | {name: library for name, (library, _) in compiled.items()}
+
+    found = _obtained(full, members, cache, _member)
+    return {name: member.function() for name, member in found.items()}
+
+
+def _taped(tape: Tape, cache: Cache) -> StoredTape:
+    """Store a tape in the cache."""
+    signature = tape.signature.to_json()
+    content = tape.instructions.tobytes().hex()
+    key = key_of("tape", signature=signature, slots=tape.slots, content=content)
+
+    def find() -> StoredTape | None:
+        found = _member(key, cache)
+        return found if isinstance(found, StoredTape) else None
+
+    def write(file: Path) -> dict[str, Any]:
+        tape.save(file)
+        return {"signature": signature, "slots": tape.slots}
+
+    def make() -> StoredTape:
+        return StoredTape(cache.store(key, write, TAPE_SUFFIX), tape)
+
+    return cache.obtain(key, find, make)[0]
+
+
+def _member(key: str, cache: Cache) -> Library | StoredTape | None:
+    """Load the library or tape stored under a key; None if there is none that can be loaded."""
+    entry = cache.find(key)
+    if entry is None or entry.library.suffix != TAPE_SUFFIX:
+        return _loaded(key, cache)
+    signature = Signature.from_json(entry.facts["signature"])
+    return StoredTape(entry, Tape.load(entry.library, signature, entry.facts["slots"]))
 
 
 def load_or_compile(
@@ -278,12 +352,14 @@ def load_or_compile(
             Also the errors of `make`.
     """
 
-    def source() -> Iterable[CSource]:
-        signature, text = make()
-        yield CSource(signature.name, text, HANDWRITTEN_LEVEL, signature=signature)
-
     cache = cache or Cache()
-    (library,) = _obtained(_set_key(key, None, 1, cache), source, cache).values()
+
+    def build_it() -> dict[str, Library]:
+        signature, text = make()
+        source = CSource(signature.name, text, HANDWRITTEN_LEVEL, signature=signature)
+        return {name: library for name, (library, _) in _compiled([source], cache).items()}
+
+    (library,) = _obtained(_set_key(key, None, 1, cache), build_it, cache, _loaded).values()
     return library.function()
 
 
@@ -316,14 +392,16 @@ def load_or_build_program(
         CodegenError: as of `load_or_compile`; or a function has no form in lanes.
     """
 
-    def source() -> Iterable[CSource]:
+    cache = cache or Cache()
+
+    def build_it() -> dict[str, Library]:
         from codegen.source import program_source
 
-        yield CSource(name, program_source(make(), own, lanes), LANE_LEVEL, lanes)
+        source = CSource(name, program_source(make(), own, lanes), LANE_LEVEL, lanes)
+        return {name: _compiled([source], cache)[name][0]}
 
-    cache = cache or Cache()
     full = key_of("program", name=name, of=_set_key(key, None, lanes, cache), own=own)
-    return _obtained(full, source, cache)[name].handle
+    return _obtained(full, build_it, cache, _loaded)[name].handle
 
 
 def _sources_of(
@@ -337,10 +415,13 @@ def _sources_of(
         yield CSource.of(name, functions[name], lanes, levels.get(name))
 
 
-def _set_key(key: str, levels: Mapping[str, int] | None, lanes: int, cache: Cache) -> str:
+def _set_key(
+    key: str, levels: Mapping[str, int] | None, lanes: int, cache: Cache, taped: bool = False
+) -> str:
     return key_of(
         "set",
         recipe=key,
+        taped=taped,
         levels=sorted((levels or {}).items()),
         lanes=lanes,
         compiler=compiler_of(cache).identity,
@@ -350,29 +431,31 @@ def _set_key(key: str, levels: Mapping[str, int] | None, lanes: int, cache: Cach
 
 
 def _obtained(
-    key: str, sources: Callable[[], Iterable[CSource]], cache: Cache
-) -> dict[str, Library]:
-    """Load the libraries of a recipe: those that its record names, or those compiled from its
-    sources."""
+    key: str,
+    make: Callable[[], Mapping[str, Member]],
+    cache: Cache,
+    load: Callable[[str, Cache], Member | None],
+) -> dict[str, Member]:
+    """Load the members of a recipe: those that its record names, or those that are made."""
 
-    def find() -> dict[str, Library] | None:
+    def find() -> dict[str, Member] | None:
         record = cache.read_record(key)
         if record is None:
             return None
-        found = {name: _loaded(member, cache) for name, member in record["members"].items()}
-        whole = {name: library for name, library in found.items() if library is not None}
+        found = {name: load(member, cache) for name, member in record["members"].items()}
+        whole = {name: member for name, member in found.items() if member is not None}
         return whole if len(whole) == len(found) else None
 
-    def make() -> dict[str, Library]:
-        built = _compiled(sources(), cache)
+    def made() -> dict[str, Member]:
+        built = dict(make())
         _remember(key, built, cache)
-        return {name: library for name, (library, _) in built.items()}
+        return built
 
-    return cache.obtain(key, find, make)[0]
+    return cache.obtain(key, find, made)[0]
 
 
-def _remember(key: str, built: Mapping[str, tuple[Library, bool]], cache: Cache) -> None:
-    members = {name: library.entry.key for name, (library, _) in built.items()}
+def _remember(key: str, built: Mapping[str, Library | StoredTape], cache: Cache) -> None:
+    members = {name: member.entry.key for name, member in built.items()}
     cache.write_record(key, {"members": members})
 
 

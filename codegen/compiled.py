@@ -18,7 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from codegen.errors import CodegenError, SlowerWarning
-from codegen.function import NativeCall, NumericFunction, Signature, available_cores
+from codegen.function import (
+    NativeCall,
+    NumericFunction,
+    Signature,
+    address,
+    available_cores,
+    ports,
+)
 from symbolic.array import Array
 
 _CHUNKS_PER_THREAD = 4
@@ -26,10 +33,6 @@ _CHUNKS_PER_THREAD = 4
 
 _ALIGNMENT = 64
 """Alignment of work memory [bytes], the size of the widest vector."""
-
-# Under short names for speed; NumPy arrays are buffers, which their type does not say.
-_writable: Any = ctypes.c_char.from_buffer
-_address_of = ctypes.addressof
 
 OTHER_COMPILER = "another compiler (environment variable CC) may do better"
 
@@ -80,14 +83,14 @@ class CompiledFunction(NumericFunction):
 
     def _evaluate_block(self, inputs: Sequence[Array], block: NDArray[np.void]) -> None:
         work = self._one.taken()
-        ports = work.ports
+        of_work = work.ports
         slot = 0
         for array in inputs:
-            ports[slot] = _address(array)
+            of_work[slot] = address(array)
             slot += 2
-        base = _address_of(_writable(block)) if block.nbytes else 0
+        base = address(block)
         for offset in self._offsets:
-            ports[slot] = base + offset
+            of_work[slot] = base + offset
             slot += 2
         status = self._one.function(work.ports_address, work.address, 0, 1)
         self._one.idle.append(work)
@@ -102,17 +105,18 @@ class CompiledFunction(NumericFunction):
         n: int,
         threads: int,
     ) -> None:
-        ports = self._ports(inputs, batched, outputs)
-        address = ctypes.addressof(ports)
+        self._require_shared(batched)
+        of_batch = ports(self.signature, inputs, batched, outputs)
+        begin_of_ports = ctypes.addressof(of_batch)
         if threads == 1 or n == 1:
-            self._run_chunk(address, 0, n)
+            self._run_chunk(begin_of_ports, 0, n)
             return
         pieces = min(n, threads * _CHUNKS_PER_THREAD)
         bounds = [n * piece // pieces for piece in range(pieces + 1)]
         chunks = deque(pairwise(bounds))
 
         # Holding the memory that the threads work on: an interrupt may end this call before them.
-        memory = (inputs, outputs, ports)
+        memory = (inputs, outputs, of_batch)
 
         def drain(_memory: object = memory) -> None:
             while True:
@@ -120,7 +124,7 @@ class CompiledFunction(NumericFunction):
                     begin, end = chunks.popleft()
                 except IndexError:
                     return
-                self._run_chunk(address, begin, end)
+                self._run_chunk(begin_of_ports, begin, end)
 
         futures = [thread_pool().submit(drain) for _ in range(min(threads, pieces))]
         try:
@@ -130,14 +134,11 @@ class CompiledFunction(NumericFunction):
         for future in futures:
             future.result()
 
-    def _ports(
-        self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
-    ) -> ctypes.Array[ctypes.c_longlong]:
-        """Return the address and the stride of every argument of a batch, in the form that the
-        driver takes.
+    def _require_shared(self, batched: Sequence[bool]) -> None:
+        """Refuse several values of an input that lanes share.
 
         Raises:
-            CodegenError: an input that lanes share has several values.
+            CodegenError: there are some.
         """
         for name, several, shared in zip(
             self.signature.input_names, batched, self._shared, strict=True
@@ -147,32 +148,24 @@ class CompiledFunction(NumericFunction):
                     f"{self.name}: input '{name}' has one value for all evaluations of a batch; "
                     "give one, or call the function once per value"
                 )
-        steps = [
-            prod(shape) if per_candidate else 0
-            for shape, per_candidate in zip(self.signature.input_shapes, batched, strict=True)
-        ] + [prod(shape) for shape in self.output_shapes]
-        ports = (ctypes.c_longlong * (2 * len(steps)))()
-        for k, (array, step) in enumerate(zip([*inputs, *outputs], steps, strict=True)):
-            ports[2 * k] = _address(array)
-            ports[2 * k + 1] = step
-        return ports
 
     def _prepared(
         self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
     ) -> tuple[Callable[[int], None], Callable[[], NativeCall]]:
-        ports = self._ports(inputs, batched, outputs)
-        address = ctypes.addressof(ports)
+        self._require_shared(batched)
+        of_batch = ports(self.signature, inputs, batched, outputs)
+        begin_of_ports = ctypes.addressof(of_batch)
 
-        def run(count: int, _memory: object = (inputs, outputs, ports)) -> None:
-            self._run_chunk(address, 0, count)
+        def run(count: int, _memory: object = (inputs, outputs, of_batch)) -> None:
+            self._run_chunk(begin_of_ports, 0, count)
 
-        return run, lambda: self._native(address)
+        return run, lambda: self._native(begin_of_ports)
 
-    def _native(self, ports: int) -> NativeCall:
+    def _native(self, of_batch: int) -> NativeCall:
         """Return addresses for calls from C, with work memory of this thread."""
         lanes = self._in_lanes if self.lanes > 1 else None
         own = [0, 0] if lanes is None else [lanes.address, lanes.own.address]
-        return NativeCall(self._one.address, own[0], ports, self._one.own.address, own[1])
+        return NativeCall(self._one.address, own[0], of_batch, self._one.own.address, own[1])
 
     def _run_chunk(self, ports_address: int, begin: int, end: int) -> None:
         several = self.lanes > 1 and end - begin > 1
@@ -297,15 +290,6 @@ def thread_pool() -> ThreadPoolExecutor:
         _threads.clear()
         _threads[process] = ThreadPoolExecutor(max(32, available_cores()), "codegen")
     return _threads[process]
-
-
-def _address(array: Array) -> int:
-    if array.size == 0:
-        return 0
-    try:
-        return _address_of(_writable(array))
-    except TypeError:  # read-only
-        return int(array.ctypes.data)
 
 
 def _same(a: Array, b: Array) -> bool:

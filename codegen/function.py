@@ -9,12 +9,14 @@ convert other inputs to such arrays.
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, dataclass
+from math import prod
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -27,6 +29,10 @@ if TYPE_CHECKING:
     import casadi as ca
 
 _FLOAT = np.dtype(np.float64)
+
+# Under short names for speed; NumPy arrays are buffers, which their type does not say.
+_writable: Any = ctypes.c_char.from_buffer
+_address_of = ctypes.addressof
 
 Shape = tuple[int, ...]
 
@@ -368,6 +374,39 @@ class PreparedBatch:
         if wanted:
             self._run(wanted)
         return self.outputs
+
+
+def ports(
+    signature: Signature,
+    inputs: Sequence[Array],
+    batched: Sequence[bool],
+    outputs: Sequence[Array],
+) -> ctypes.Array[ctypes.c_longlong]:
+    """Return the address and step [numbers] of every argument and result of a batch, as drivers in
+    C take them (`codegen/c/driver.c`).
+
+    Args:
+        batched: which inputs have one value for each evaluation.
+    """
+    steps = [
+        prod(shape) if per_candidate else 0
+        for shape, per_candidate in zip(signature.input_shapes, batched, strict=True)
+    ] + [prod(shape) for shape in signature.output_shapes]
+    found = (ctypes.c_longlong * (2 * len(steps)))()
+    for k, (array, step) in enumerate(zip([*inputs, *outputs], steps, strict=True)):
+        found[2 * k] = address(array)
+        found[2 * k + 1] = step
+    return found
+
+
+def address(array: NDArray[Any]) -> int:
+    """Return the address of an array's first entry; 0 of an empty array."""
+    if array.size == 0:
+        return 0
+    try:
+        return _address_of(_writable(array))
+    except TypeError:  # read-only
+        return int(array.ctypes.data)
 
 
 def available_cores() -> int:

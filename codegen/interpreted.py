@@ -1,16 +1,13 @@
 """CasADi's own evaluation, the oracle of the compiled functions: outputs and first derivatives.
 
-It also serves where a function is evaluated so few times that compiling it would take longer. Then
-CasADi's instructions of a function of scalars are run over many samples at once (`tape.cpp`).
+It also serves where a function is evaluated so few times that compiling it would take longer,
+unless it is a function of scalars, which runs from its tape (`codegen.tape`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache, cached_property
-from importlib import import_module
-from typing import Any
 
 import casadi as ca
 import numpy as np
@@ -21,9 +18,8 @@ from codegen.cache import Cache
 from codegen.errors import CodegenError
 from codegen.function import NumericFunction, Signature
 from codegen.source import dense
+from codegen.tape import Tape, TapeFunction
 from symbolic.array import Array
-from symbolic.errors import BridgeError
-from symbolic.robot.bridge import REMEDY
 
 AGREEMENT_TOLERANCE = 1e-10
 """Largest relative difference allowed between compiled and interpreted."""
@@ -31,45 +27,6 @@ AGREEMENT_TOLERANCE = 1e-10
 RESIDUE = 1e-6
 """Outputs whose largest entry is below this (m, rad, N, s) are residues of rounding and are
 compared to this instead of to their own size."""
-
-
-@cache
-def compiled_tape() -> Any:
-    """Load the compiled module.
-
-    Raises:
-        BridgeError: it is missing or cannot be loaded.
-    """
-    try:
-        return import_module("codegen._tape")
-    except ImportError as error:
-        raise BridgeError(
-            f"the compiled part of the interpreter cannot be loaded ({error}); {REMEDY}"
-        ) from error
-
-
-def tape_of(function: ca.Function) -> Any:
-    """Return the instructions of a function of scalars for many samples at once; None where it is
-    no such function, or has others than `tape.cpp` knows."""
-    if not function.is_a("SXFunction"):
-        return None
-    known = {getattr(ca, f"OP_{name}"): k for k, name in enumerate(compiled_tape().OPERATIONS)}
-    numbers = range(function.n_instructions())
-    codes = [function.instruction_id(k) for k in numbers]
-    if not known.keys() >= set(codes):
-        return None
-    rows = []
-    for k, code in zip(numbers, codes, strict=True):
-        given, made = function.instruction_input(k), function.instruction_output(k)
-        constant = function.instruction_constant(k) if code == ca.OP_CONST else 0.0
-        if code == ca.OP_INPUT:
-            row = (made[0], *given)
-        elif code == ca.OP_OUTPUT:
-            row = (made[0], given[0], made[1])
-        else:
-            row = (made[0], *given, *[0] * (2 - len(given)))
-        rows.append((known[code], *row, constant))
-    return compiled_tape().Tape(*map(list, zip(*rows, strict=True)), function.sz_w())
 
 
 class InterpretedFunction(NumericFunction):
@@ -95,9 +52,6 @@ class InterpretedFunction(NumericFunction):
         n: int,
         threads: int,
     ) -> None:
-        if n > 1 and self._tape is not None:
-            self._tape.run(list(inputs), list(batched), list(outputs), n)
-            return
         # One evaluation's memory serves all: CasADi gets addresses once a batch.
         own = [
             np.empty(array.shape[1:]) if per else array
@@ -115,10 +69,6 @@ class InterpretedFunction(NumericFunction):
             for array, one in zip(outputs, found, strict=True):
                 array[k] = one
 
-    @cached_property
-    def _tape(self) -> Any:
-        return tape_of(self.function)
-
     def _evaluator(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> Callable[[], None]:
         """Bind the function to arrays that it reads and writes at each call."""
         buffer, evaluate = self.function.buffer()
@@ -133,6 +83,12 @@ class InterpretedFunction(NumericFunction):
                 raise CodegenError(f"{self.name}: the function failed")
 
         return checked
+
+
+def interpret(function: ca.Function) -> NumericFunction:
+    """Return a function that runs without a compiler: from its tape, or by CasADi."""
+    tape = Tape.of(function)
+    return InterpretedFunction(function) if tape is None else TapeFunction(tape)
 
 
 @dataclass(frozen=True)

@@ -28,18 +28,19 @@ if TYPE_CHECKING:
 Loaded = TypeVar("Loaded")
 
 CACHED_WORKCELLS = 2
-"""Workcells that a function remembers."""
+"""Number of workcells for which `cache_by_workcell` keeps results."""
 
 
 class CompiledCell:
-    """Compiled functions of a workcell. Share one wherever several sets of functions are needed.
+    """Compiled functions of a workcell, built in sets on first use. Share one object wherever
+    several sets are needed.
 
-    A set is loaded where it was built before, also by other processes; then neither expressions
-    nor the model are made. Otherwise it is made from the model, which is built once.
+    A set that was built before, also by another process, is loaded from the cache, without a
+    symbolic model. Otherwise it is built from the model, which is made once.
 
     Attributes:
-        workcell: the description.
-        cache: where libraries are kept, None for the user's folder.
+        workcell: description of the cell.
+        cache: cache of compiled libraries, None for the user's cache.
         is_compiled: True, except for an `InterpretedCell`.
     """
 
@@ -51,7 +52,9 @@ class CompiledCell:
         """Describe the cell; nothing is built yet.
 
         Args:
-            model: the cell's symbolic model, if it does not follow from the workcell alone, for
+            workcell: description of the cell.
+            cache: cache of compiled libraries, None for the user's cache.
+            model: symbolic model of the cell if it does not follow from the workcell alone, for
                 example with other start postures.
 
         Raises:
@@ -66,13 +69,15 @@ class CompiledCell:
         self._loaded: dict[object, Any] = {}
 
     def with_parameters(self, workcell: Workcell) -> CompiledCell:
-        """Return another workcell's functions that share the loaded ones."""
+        """Return the functions of a workcell with other parameters, which share the loaded
+        libraries."""
         other = CompiledCell(workcell, self.cache)
         other._loaded, other._is_changed = self._loaded, True
         return other
 
     def memoise(self, key: object, load: Callable[[], Loaded]) -> Loaded:
-        """Return the value cached under `key`; cells derived from each other share the cache."""
+        """Return the value cached under `key`, or load it. Cells made by `with_parameters` share
+        the cache."""
         if key not in self._loaded:
             self._loaded[key] = load()
         found: Loaded = self._loaded[key]
@@ -80,15 +85,15 @@ class CompiledCell:
 
     @classmethod
     def of(cls, cell: Workcell | CompiledCell) -> CompiledCell:
-        """Return the functions of a workcell; compiled ones are shared."""
+        """Return the compiled functions of a workcell; a `CompiledCell` is returned unchanged."""
         return cell if isinstance(cell, CompiledCell) else cls(cell)
 
     @cached_property
     def model(self) -> CellModel:
-        """The symbolic model.
+        """The symbolic model of the cell.
 
         Raises:
-            DualArmError: it cannot be built.
+            DualArmError: the model cannot be built.
         """
         # Not imported at the top: a warm start needs neither CasADi nor Pinocchio.
         from symbolic.cell_model import build_cell_model
@@ -131,10 +136,10 @@ class CompiledCell:
 
     @cached_property
     def bodies(self) -> CellBodies:
-        """Arms and bodies, without start postures.
+        """Arms and collision bodies, without start postures.
 
         Raises:
-            DualArmError: they cannot be read.
+            DualArmError: a robot description or a shape cannot be read.
         """
         if self._given is not None:
             return self._given
@@ -144,7 +149,7 @@ class CompiledCell:
 
     @property
     def geometry(self) -> CellGeometry:
-        """The collision bodies and the pairs of them that are checked."""
+        """The collision bodies, and the pairs of them that are checked."""
         return self.bodies.geometry
 
     @cached_property
@@ -157,12 +162,12 @@ class CompiledCell:
 
     @cached_property
     def symbols(self) -> CellModel:
-        """The model whose functions take the parameters as inputs."""
+        """The symbolic model whose functions take the parameters as inputs."""
         return self.numbers.symbolic(self.bodies)
 
     @cached_property
     def start(self) -> tuple[Array, Array]:
-        """(n,) joints of each arm at the first waypoint [rad].
+        """(n,) joint positions of each arm at the first waypoint [rad].
 
         Raises:
             DualArmError: the model cannot be built.
@@ -193,18 +198,20 @@ class CompiledCell:
         return self.memoise(key, find)
 
     def vector(self, group: str) -> Array:
-        """Return the parameters (n,) of a group, see `symbolic.parameters`."""
+        """Return the values (n,) of a group of parameters, see `symbolic.parameters`."""
         from symbolic.parameters import START
 
         return np.concatenate(self.start) if group == START else self.numbers.vector(group)
 
     def key(self, name: str, *details: str, bodies: bool = True) -> str:
-        """Compute a recipe's key: the ingredients of a set of functions (CasADi is part of every
-        set's).
+        """Return the key under which a set of functions is cached. It depends on the topology of
+        the cell and on the code that makes the expressions; the version of CasADi is added for
+        every set.
 
         Args:
-            details: further ingredients.
-            bodies: whether bodies belong to it.
+            name: name of the set.
+            details: further values on which the functions depend.
+            bodies: whether the set depends on the collision bodies.
         """
         numbers = self.numbers
         return key_of(
@@ -223,6 +230,7 @@ class CompiledCell:
         lanes: int = 1,
         levels: Mapping[str, int] | None = None,
         bodies: bool = True,
+        taped: bool = False,
     ) -> dict[str, NumericFunction]:
         """Return a set of functions with this cell's parameters, from the cache if one of the same
         topology was built before.
@@ -233,21 +241,22 @@ class CompiledCell:
             details: further ingredients of `make`.
             lanes, levels: see `codegen.build.build`.
             bodies: whether it depends on the bodies.
+            taped: see `codegen.build.load_or_build`.
 
         Raises:
             DualArmError: the model or its code cannot be built.
         """
         key = self.key(name, *details, bodies=bodies)
         built = self.memoise(
-            (key, lanes, str(levels)),
+            (key, lanes, str(levels), taped),
             lambda: load_or_build(
-                key, lambda: make(self.symbols), self.cache, lanes=lanes, levels=levels
+                key, lambda: make(self.symbols), self.cache, lanes=lanes, levels=levels, taped=taped
             ),
         )
         return {name: self.bound(function) for name, function in built.items()}
 
     def bound(self, function: NumericFunction) -> NumericFunction:
-        """Bind this cell's parameters to a function's last inputs."""
+        """Return a function with this cell's parameters as its last inputs."""
         from symbolic.parameters import GROUPS
 
         return function.bound(
@@ -256,7 +265,7 @@ class CompiledCell:
 
     @cached_property
     def evaluators(self) -> dict[str, NumericFunction]:
-        """Every function of `symbolic.functions.cell_functions`."""
+        """All functions of `symbolic.functions.cell_functions`, compiled, by name."""
 
         def make(model: CellModel) -> Mapping[str, ca.Function]:
             from symbolic.functions import arm_functions
@@ -268,7 +277,7 @@ class CompiledCell:
 
     @cached_property
     def screening(self) -> dict[str, NumericFunction]:
-        """The functions that depend on the bodies."""
+        """The compiled functions that depend on the collision bodies, by name."""
 
         def make(model: CellModel) -> Mapping[str, ca.Function]:
             return model.screening
@@ -277,10 +286,10 @@ class CompiledCell:
 
 
 class InterpretedCell(CompiledCell):
-    """A cell of which nothing is compiled: CasADi's interpreter evaluates its functions.
+    """Functions of a workcell that CasADi's interpreter evaluates; nothing is compiled.
 
-    For what is evaluated some hundred times: a candidate takes fifty times as long, and the sets
-    of a new cell take a minute to compile.
+    It is meant for a few hundred evaluations: one takes fifty times as long, but compiling the sets
+    of a new cell takes a minute.
     """
 
     is_compiled = False
@@ -290,7 +299,7 @@ class InterpretedCell(CompiledCell):
 
     @cached_property
     def start(self) -> tuple[Array, Array]:
-        """Return the joints (n,) of each arm at the first waypoint [rad]."""
+        """(n,) joint positions of each arm at the first waypoint [rad]."""
         return self.model.start
 
     def functions(
@@ -300,26 +309,26 @@ class InterpretedCell(CompiledCell):
         *details: str,
         **choices: Any,
     ) -> dict[str, NumericFunction]:
-        """Return a set of functions of this cell, made from its model."""
-        from codegen.interpreted import InterpretedFunction
+        """Return a set of functions of this cell, made from its symbolic model."""
+        from codegen.interpreted import interpret
 
-        return {name: InterpretedFunction(function) for name, function in make(self.model).items()}
+        return {name: interpret(function) for name, function in make(self.model).items()}
 
 
 def is_interpretable(workcell: Workcell) -> bool:
-    """Return True if candidates take CasADi's interpreter milliseconds: no program solves for their
-    forces, and no compiled passes time them."""
+    """Return True if CasADi's interpreter evaluates a candidate in milliseconds, because forces
+    have a closed form and candidates are not timed by compiled code."""
     return contact_model(workcell).has_closed_form and not workcell.task.law.is_drivable
 
 
 @lru_cache
 def _expressions(folder: Path) -> str:
-    """Compute the digest of the package that writes formulas, as of this process's first call."""
+    """Return the digest of the source code of `symbolic` at the first call of this process."""
     return Cache(folder).code_digest("symbolic")
 
 
 class _Identity:
-    """Compares workcells by identity in a cache."""
+    """A workcell that equals only itself, as a key of a cache."""
 
     def __init__(self, workcell: Workcell) -> None:
         self.workcell = workcell
@@ -332,7 +341,8 @@ class _Identity:
 
 
 def cache_by_workcell(build: Callable[[Workcell], Loaded]) -> Callable[[Workcell], Loaded]:
-    """Cache a function's result per workcell, by identity."""
+    """Return a function that caches its results for the last workcells, which are compared by
+    identity."""
 
     @lru_cache(maxsize=CACHED_WORKCELLS)
     def kept(identity: _Identity) -> Loaded:
@@ -355,13 +365,13 @@ _held_numbers = cache_by_workcell(_numbers)
 
 
 def bound_to(function: NumericFunction, numbers: WorkcellParameters) -> NumericFunction:
-    """Bind a cell's parameters, except start postures, to a function's last inputs."""
+    """Return a function with a cell's parameters, except start postures, as its last inputs."""
     names = [name for name in function.input_names if name in numbers.sizes]
     return function.bound({name: numbers.vector(name) for name in names})
 
 
 _held: dict[tuple[Path, str, int], NumericFunction] = {}
-"""Functions that `contact_function` loaded: cells that are tried out share them."""
+"""Functions loaded by `contact_function`, which all cells of the same topology share."""
 
 
 def contact_function(
@@ -396,7 +406,8 @@ def contact_function(
 
 
 EVALUATORS, SCREENING = "evaluators", "screening"
-"""Names of the sets of a cell's evaluators: those that know no bodies, and the others."""
+"""Names of the two sets of evaluators: functions that do not depend on collision bodies, and
+functions that do."""
 
 EVALUATOR_LANES = 0
-"""Lanes of the evaluators; 0 for as many as suit the machine."""
+"""Number of lanes of the evaluators; 0 for as many as suit the machine."""

@@ -22,11 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from symbolic.array import Array
+from symbolic.extension import compiled_module, require_same_minor
 from symbolic.geometry.bodies import BOX, CollisionBody
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.geometry.pieces import ConvexShape, Hull, Piece, shrunk
 from symbolic.records import PAYLOAD_NAME, Box, Capsule, Cylinder, Sphere
-from symbolic.robot.bridge import compiled_module, require_same_minor
 
 INTERSECTING, OPEN, APART = -1, 0, 1
 """Verdicts of `BodyDistances.decide`: proven to intersect, not proven, proven to be apart."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cache
+from functools import cache, partial
 
 import casadi as ca
 import numpy as np
@@ -51,19 +51,15 @@ PRECOMPILED = (
     JointLimit(0, 0, "lower"),
     JointLimit(1, 0, "lower"),
 )
-"""Members of the families whose functions are compiled at once: nearly every solve needs them.
-Every clearance of an arm is a family of its own, of which a cell has hundreds and a solve needs
-few: these are compiled on first use and cached."""
+"""One member of each family of constraints whose functions are made at once, because nearly
+every solve needs them. Each clearance is a family of its own; a cell has hundreds and a solve needs
+few, so their functions are made on first use and cached."""
 
 ARMS = (0, 1)
 
-DEFERRED_LEVELS: dict[Order, int] = {"first": 1, "second": 0}
-"""Optimisation levels of functions that are compiled on first use: 0.1 and 0.2 s each on the rack.
-Few second derivatives of clearances are ever needed."""
-
 PLACE_SPACING = 0.0025
 """Approximate distance of neighbouring places in the path parameter. The clearance covers minima
-between two places; certification checks them in the end."""
+between two places, and the final certification checks them."""
 
 Indices = NDArray[np.intp]
 
@@ -72,17 +68,17 @@ class PolishFunctions:
     """Compiled functions for the polish of one workcell.
 
     Attributes:
-        built: by name; see `symbolic.smooth`: forces and pressure at samples, inverse kinematics of
-            both arms, in drivable cells limits along a driven path; rows at places of
-            the path, missing ones compiled on first use.
-        closure: function of an arm and an order to the arm's joints as a function of the box pose;
-            see `symbolic.smooth.places`.
-        row: function of a constraint and an order to its family's row function; see
-            `symbolic.smooth.places.row_function`.
-        numbers, arms: functions of a constraint to its parameters, and to the arms on whose joints
-            its value depends.
+        built: the functions by name, described in `symbolic.smooth`: forces and pressure at
+            samples, inverse kinematics of both arms, in drivable cells limits along a driven path,
+            and rows at places of the path. Missing ones are made on first use.
+        closure: function of (arm, order) that returns the function from the box pose to the arm's
+            joints, see `symbolic.smooth.places`.
+        row: function of (constraint, order) that returns the function of the constraint's family,
+            see `symbolic.smooth.places.row_function`.
+        numbers: function of a constraint that returns its parameters.
+        arms: function of a constraint that returns the arms on whose joints its value depends.
         model: arms and bodies of the cell.
-        separable: pairs with known gaps; see `gaps`.
+        separable: pairs of bodies for which `gaps` computes separating-axis gaps.
     """
 
     def __init__(self, compiled: CompiledCell, built: Mapping[str, NumericFunction]) -> None:
@@ -104,8 +100,7 @@ class PolishFunctions:
             def make(model: CellBodies) -> dict[str, ca.Function]:
                 return {name: row_function(self._symbols(model), constraint, order)}
 
-            level = {name: DEFERRED_LEVELS[order]}
-            self.built |= self._cell.functions(f"polish {name}", make, str(level), levels=level)
+            self.built |= self._cell.functions(f"polish {name}", make, lanes=0, taped=True)
         return self.built[name]
 
     def _numbers(self, constraint: PathConstraint) -> Array:
@@ -115,8 +110,8 @@ class PolishFunctions:
         return constraint.arms(self.model)
 
     def gaps(self, pair: int, pose: Array) -> Array:
-        """Evaluate the gaps (n, SEPARATING_DIRECTIONS) [m] of a separable pair at box poses (n,
-        6)."""
+        """Compute the gaps (n, SEPARATING_DIRECTIONS) of a separable pair along all separating
+        directions for box poses (n, 6) [m]."""
         return self.built[GAPS].batch(pose, self._obstacle(pair))["gaps"]
 
 
@@ -136,12 +131,13 @@ def sample_quantities(workcell: Workcell) -> tuple[Quantity, ...]:
 
 
 def polish_functions(compiled: CompiledCell) -> PolishFunctions:
-    """Load or build the functions of a workcell's programs.
+    """Load the compiled functions for the polish of a workcell, or build them.
 
-    Functions of many samples or places per call are evaluated in lanes at optimisation level 1:
-    higher levels compile three times as long and gain nothing (measured on the rack: every function
-    within 5 %, one slower by 40 %). Of the first and the last two samples, only second derivatives
-    are. Functions of whole paths multiply sparse matrices, which have no form in lanes.
+    Functions of many samples or places per call are compiled for evaluation in lanes at
+    optimisation level 1; higher levels take three times as long to compile and gain nothing
+    (measured on the rack: every function within 5 %, one slower by 40 %). For the first and the
+    last two samples, only second derivatives are evaluated in lanes. Functions of whole paths
+    multiply sparse matrices and have no form for lanes.
 
     Raises:
         DualArmError: the cell's model cannot be built, or its functions cannot be compiled.
@@ -173,19 +169,16 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
         return found | {GAPS: gap_function(place)}
 
     details = str(levels)
-    built = compiled.functions(
-        "polish in lanes", lane_functions, details, levels=levels, lanes=0, bodies=False
-    )
+    taped = partial(compiled.functions, levels=levels, lanes=0, taped=True)
+    built = taped("polish in lanes", lane_functions, details, bodies=False)
     built |= compiled.functions("polish", scalar_functions, details, levels=levels, bodies=False)
-    built |= compiled.functions("polish rows", rows, details, levels=levels, lanes=0)
+    built |= taped("polish rows", rows, details)
     if "load" in quantities:
-        built |= compiled.functions("held", _held, levels=levels, lanes=0, bodies=False)
+        built |= taped("held", _held, bodies=False)
     if compiled.workcell.task.law.is_drivable:
-        built |= compiled.functions("driven", driven_functions, lanes=0, bodies=False)
+        built |= taped("driven", driven_functions, bodies=False)
         if not contact_model(compiled.workcell).has_closed_form:
-            built |= compiled.functions(
-                "driven held", _driven_held, levels=levels, lanes=0, bodies=False
-            )
+            built |= taped("driven held", _driven_held, bodies=False)
     return PolishFunctions(compiled, built)
 
 
@@ -217,8 +210,7 @@ class Grid:
         per_sample: number of places per interval between samples.
         parameter: (m,) path parameter of all places, in [0, 1].
         sample_parameter: (n,) path parameter of the samples.
-        basis, rate_basis: (m, n_waypoints) matrices: poses = basis @ waypoints, and the first
-            derivative by the path parameter = rate_basis @ waypoints.
+        basis, rate_basis: (m, n_waypoints) matrices: poses = basis
     """
 
     def __init__(self, task: Task) -> None:

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from codegen.interpreted import InterpretedFunction
+from codegen.interpreted import interpret
 from hybrid_opt.compiled_cell import contact_function
 from hybrid_opt.robust.cases import GoverningCases, governing_cases
 from hybrid_opt.robust.force import BoxMotion, robust_model
@@ -48,7 +48,7 @@ class RobustSamples:
         self._workcell, self._model = workcell, robust_model(workcell)
         self._cases = self._model.worst_cases(workcell.uncertainty, LEADER)
         self._gradient = contact_function(workcell, "case gradient", case_gradient_function)
-        self._motion = InterpretedFunction(motion_function(workcell.task))
+        self._motion = interpret(motion_function(workcell.task))
 
     def forces(self, found: Mapping[str, Array]) -> Array:
         """Compute the robust forces (n, 2) [N] at n samples from the evaluator's outputs for one

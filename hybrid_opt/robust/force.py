@@ -529,12 +529,12 @@ def interpreted_robust_model(workcell: Workcell) -> RobustModel:
     """Return the robust model of a workcell with interpreted functions, for few samples: nothing is
     compiled."""
     # Not imported at the top: what is compiled already needs no CasADi.
-    from codegen.interpreted import InterpretedFunction
+    from codegen.interpreted import interpret
 
     def load(
         cell: Workcell, name: str, make: Callable[[Workcell], ca.Function], lanes: int
     ) -> NumericFunction:
-        return InterpretedFunction(make(cell))
+        return interpret(make(cell))
 
     return RobustModel(workcell, load)
 

@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.interpreted import InterpretedFunction
+from codegen.interpreted import interpret
 from hybrid_opt.carry import Carry
 from hybrid_opt.compiled_cell import bound_to, cache_by_workcell, contact_function
 from hybrid_opt.robust.cases import (
@@ -288,10 +288,10 @@ class GoverningForce:
         if self._squeezed:
             numbers = WorkcellParameters(self._workcell)
             made = case_gradient_function(numbers.symbols(), numbers=True)
-            function = bound_to(InterpretedFunction(made), numbers)
+            function = bound_to(interpret(made), numbers)
         else:
             made = case_gradient_function(self._workcell, 1 - self._leader, numbers=True)
-            function = InterpretedFunction(made)
+            function = interpret(made)
         slopes = []
         for arm in (0, 1):
             cases = self._cases.copy()

@@ -10,7 +10,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.interpreted import InterpretedFunction
+from codegen.interpreted import interpret
 from hybrid_opt.carry import Judgement
 from hybrid_opt.collision.certify import LostPathError
 from hybrid_opt.collision.checker import CollisionChecker
@@ -246,9 +246,7 @@ class PoseJudge:
 def judge_of(bodies: CellBodies) -> PoseJudge:
     """Build the collision checker of a cell, without a margin."""
     made = bodies.screening
-    functions = {
-        name: InterpretedFunction(made[name]) for name in made if not name.endswith("motion")
-    }
+    functions = {name: interpret(made[name]) for name in made if not name.endswith("motion")}
     return PoseJudge(bodies.geometry, CollisionChecker(bodies.geometry, functions), 0.0)
 
 
@@ -317,7 +315,7 @@ class Trial:
         self.evaluator = CandidateEvaluator(self.workcell, compiled=interpreted)
         # Forces that a solver finds take most of a candidate's time.
         self._solved = not contact_model(self.workcell).has_closed_form
-        self._motion = InterpretedFunction(motion_function(model)) if self._solved else None
+        self._motion = interpret(motion_function(model)) if self._solved else None
 
     @property
     def initial(self) -> Array:

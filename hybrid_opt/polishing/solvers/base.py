@@ -14,7 +14,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from symbolic.array import Array, Figure
-from symbolic.robot.bridge import compiled_module
+from symbolic.extension import compiled_module
 
 OPTIMALITY_TOLERANCE = 1e-6
 """Tolerance of the optimality conditions, in scaled rows and variables."""

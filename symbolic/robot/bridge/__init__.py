@@ -16,15 +16,12 @@ Raises:
 from __future__ import annotations
 
 from functools import cache
-from importlib import import_module
 from typing import Any
 
 import casadi
 import pinocchio
 
-from symbolic.errors import BridgeError
-
-REMEDY = "run `pip install -e .` in the project's folder to compile it for this environment"
+from symbolic.extension import compiled_module, require_same_minor
 
 
 def frame_kinematics(model: pinocchio.Model, frame: int) -> casadi.Function:
@@ -61,44 +58,6 @@ def inverse_dynamics(model: pinocchio.Model) -> casadi.Function:
     q (nq,), v (nv,), a (nv,) -> torque (nv,) [N m]; gravity is the model's, rotor inertias count.
     """
     return _function(_extension().inverse_dynamics(model.saveToString()))
-
-
-def require_same_minor(built: dict[str, str], installed: dict[str, str]) -> None:
-    """Check that versions agree in major and minor number.
-
-    Args:
-        built, installed: versions by library name.
-
-    Raises:
-        BridgeError: versions differ; the message names every such library.
-    """
-    different = [
-        f"{library} {installed[library]} is installed, {version} was compiled against"
-        for library, version in built.items()
-        if installed[library].split(".")[:2] != version.split(".")[:2]
-    ]
-    if different:
-        raise BridgeError(
-            f"the compiled modules do not fit: {'; '.join(different)}; {REMEDY}", code="versions"
-        )
-
-
-def compiled_module(name: str, part: str) -> Any:
-    """Import one of the project's compiled modules.
-
-    Args:
-        name: name of the module; the libraries that it links to have been loaded already.
-        part: name of the module for people, as in 'the compiled part of the polish'.
-
-    Raises:
-        BridgeError: the module is missing or cannot be loaded.
-    """
-    try:
-        return import_module(name)
-    except ImportError as error:
-        raise BridgeError(
-            f"{part} cannot be loaded ({error}); {REMEDY}", code="not-loadable"
-        ) from error
 
 
 @cache

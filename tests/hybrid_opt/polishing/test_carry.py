@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from codegen.cache import Cache
-from codegen.compiled import CompiledFunction
 from codegen.interpreted import InterpretedFunction
+from codegen.tape import TapeFunction
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.polishing import cell as cell_module
 from hybrid_opt.polishing.carry import (
@@ -123,7 +123,7 @@ def test_the_dip_between_two_places_is_that_of_the_lines_from_both_sides() -> No
     np.testing.assert_array_equal(low[53:], height[53:])
 
 
-def test_a_row_compiled_on_demand_is_the_interpreted_one_and_is_kept(
+def test_a_row_made_on_demand_is_the_interpreted_one_and_is_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compiled = CompiledCell(rack_cell(), Cache(tmp_path))
@@ -136,7 +136,7 @@ def test_a_row_compiled_on_demand_is_the_interpreted_one_and_is_kept(
     for order in ORDERS:
         function = made.row(row, order)
         expected = InterpretedFunction(row_function(symbols, row, order))
-        assert isinstance(function, CompiledFunction)
+        assert isinstance(function, TapeFunction)
         assert made.row(row, order) is function
         with monkeypatch.context() as patched:
             patched.setattr(cell_module, "row_function", not_again)

@@ -19,6 +19,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from studies.research.plain.arm import PlainArm
+from symbolic import extension
 from symbolic.array import Array
 from symbolic.errors import BridgeError, RobotModelError
 from symbolic.read.arms import reduced_model
@@ -342,10 +343,10 @@ def test_extension_built_for_other_versions(monkeypatch: pytest.MonkeyPatch) -> 
 def test_only_the_patch_version_may_differ(built: str, installed: str, fits: bool) -> None:
     versions = {"pinocchio": built}, {"pinocchio": installed}
     if fits:
-        bridge.require_same_minor(*versions)
+        extension.require_same_minor(*versions)
     else:
         with refused(BridgeError, "versions", installed):
-            bridge.require_same_minor(*versions)
+            extension.require_same_minor(*versions)
 
 
 @pytest.mark.usefixtures("fresh_extension")

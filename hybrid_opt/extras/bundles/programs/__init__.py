@@ -8,13 +8,13 @@ from string import Template
 
 
 def program(name: str) -> str:
-    """Return the text of a program as it stands beside the others in a bundle."""
+    """Return the text of a program that is copied into bundles unchanged."""
     text = (files(__name__) / name).read_text("utf-8")
     return text.replace(f"from {__name__}.", "from ")
 
 
 def filled(name: str, **values: object) -> str:
-    """Return the text of a file with values for its $names.
+    """Return the text of a template file with values in place of its $names.
 
     Raises:
         KeyError: a value is missing.

@@ -26,29 +26,31 @@ from hybrid_opt.extras.bundles.programs.carry_machine import UNLOADED, Machine, 
 FILE = "measured.toml"
 
 BACK = 3
-"""Exit code of a job that went back to its beginning."""
+"""Exit code of a job that returned to its beginning."""
 
 LAG, STIFFNESS, SPEED = 0.01, 0.25, 0.95
-"""Allowed error of the lag [s] and of the stiffness, over the planned one; least speed over the
-planned one."""
+"""Tolerances: of the lag [s], of the stiffness relative to the planned one, and least speed over
+the planned one."""
 
 EVERY, WINDOW = 0.02, 5
-"""Between two looks at moving arms [s]; a speed is of so many of these."""
+"""Time between two measurements of moving arms [s], and number of measurements from which a speed
+is computed."""
 
 AHEAD, BEHIND = 0.05, 0.3
-"""A posture is looked for so far around its command [s]."""
+"""A measured posture is searched for on the path within these times around its command [s]."""
 
 IN_AIR = {"behind": 0.15, "skew": 0.1}
-"""How late arms may be where nothing is between them [s]."""
+"""Limits on the delay of arms while nothing is between the pads [s]."""
 
 FAST = 0.5
-"""Share of its largest speed above which a posture says how late an arm is."""
+"""Share of an arm's largest speed above which its postures are used to measure its delay."""
 
 SLOWER = 5.0
-"""A block is pressed so much slower than the box."""
+"""Factor by which a block is pressed more slowly than the box."""
 
 LEAST_FORCE, LEAST_SHARE = 5.0, 0.05
-"""Less than this force [N], or share of the largest commanded one, is no contact."""
+"""Least force that counts as contact [N], and the same as a share of the largest commanded
+force."""
 
 FITTED, FULL = 0.3, 0.95
 """Shares of the largest measured force above which the stiffness is fitted, and of the largest
@@ -61,15 +63,15 @@ BLOCK = "put a block as wide as the box where the box stands at the start; then 
 
 @dataclass(frozen=True)
 class Measured:
-    """The numbers of an arm; nan where the job does not depend on one.
+    """Measured values of an arm; nan for values on which the job does not depend.
 
     Attributes:
         lag: delay behind the commands [s].
-        late: part of it that nothing compensates: both arms have to agree [s].
+        late: part of the lag that is not compensated [s]; it has to be the same for both arms.
         speed: largest speed of the pad over the planned one.
-        offset: of the force sensor in the air [N].
-        sign: of what it reads when the pad presses.
-        stiffness: of each arm at its pad, both in series [N/m].
+        offset: reading of the force sensor in the air [N].
+        sign: sign of its reading when the pad presses.
+        stiffness: stiffness of each arm at its pad, if both act in series [N/m].
         press: measured over commanded force.
     """
 
@@ -83,8 +85,8 @@ class Measured:
 
 
 def unloaded(job: Job) -> Job:
-    """Return a job that touches nothing: without forces, and with hands that stay off; arms may be
-    later than with a box."""
+    """Return the job without forces and with hands that stay off, for a run without a box; the
+    limits on delays are wider."""
     robots = []
     for robot in job.robots:
         contact = robot["hold_effort_without_gravity"]
@@ -103,7 +105,7 @@ def unloaded(job: Job) -> Job:
 
 
 def pressing(job: Job) -> Job:
-    """Return the part of a job up to the end of its press, slowed down."""
+    """Return the part of a job up to the end of the phase that presses, slowed down."""
     count = 1 + next(i for i, each in enumerate(job.document["phases"]) if each["name"] == "press")
     phases = job.document["phases"][:count]
     end = phases[-1]["last"] + 1
@@ -128,14 +130,14 @@ def _lists(robot: dict[str, Any]) -> Iterator[tuple[str, list[Any]]]:
 
 @dataclass(frozen=True)
 class Look:
-    """A look at moving arms.
+    """One measurement of moving arms.
 
     Attributes:
-        time: [s].
+        time: of the measurement [s].
         s: commanded coordinate [s].
-        direction: along the path, 1 or -1.
-        age: of each arm's posture [s].
-        q: joint positions of each arm [rad, m].
+        direction: direction along the path, 1 or -1.
+        age: age of each arm's posture [s].
+        q: joint positions of each arm [rad or m].
     """
 
     time: float
@@ -147,13 +149,13 @@ class Look:
 
 @dataclass
 class Looks:
-    """Looks at both arms while they are measured.
+    """All measurements of both arms.
 
     Attributes:
-        moving: in the air.
+        moving: measurements in the air.
         forces: raw readings of each arm's sensor in the air [N].
-        pressed: time, distance of the pressing pad beyond its place [m], commanded force and raw
-            readings [N] of each look while a block is pressed.
+        pressed: for each measurement while a block is pressed: time, distance of the pressing pad
+            beyond its planned position [m], commanded force, and raw readings [N].
     """
 
     moving: list[Look] = field(default_factory=list)
@@ -163,11 +165,14 @@ class Looks:
     def note(
         self, now: float, machine: Machine, seen: Seen, raw: list[float | None], way: float = nan
     ) -> None:
-        """Note what is seen at a time [s].
+        """Store a measurement.
 
         Args:
-            raw: readings of both sensors [N]; None without one.
-            way: of the pressing pad beyond its place [m].
+            now: time [s].
+            machine: state of the job.
+            seen: measured state of the arms.
+            raw: readings of both sensors [N]; None without a sensor.
+            way: distance of the pressing pad beyond its planned position [m].
         """
         clock, job = machine.clock, machine.job
         if machine.state != "running" or clock.turning:
@@ -184,7 +189,7 @@ class Looks:
             self.moving.append(Look(now, clock.s, clock.rate, seen.age, q))
 
     def offset(self, arm: int) -> float:
-        """Return the reading of an arm's sensor in the air [N]; nan without one."""
+        """Return the reading of an arm's sensor in the air [N], nan without a sensor."""
         return median(self.forces[arm]) if self.forces[arm] else nan
 
     def speed(self, job: Job, arm: int) -> float:
@@ -200,7 +205,7 @@ class Looks:
         return max(found) / max(planned)
 
     def late(self, job: Job, arm: int) -> float:
-        """Return how late an arm is behind the clock [s]."""
+        """Return the delay of an arm behind the clock [s]."""
         fastest, found = max(job.speed(arm, s) for s in job.time), []
         for look in self.moving:
             forward = look.direction
@@ -212,7 +217,7 @@ class Looks:
         return median(found) if found else nan
 
     def contact(self, arm: int, lag: float) -> dict[str, float]:
-        """Return sign, stiffness and press of an arm with a sensor, by its lag [s].
+        """Return sign, stiffness and press of an arm with a sensor, whose lag is known [s].
 
         Raises:
             Refused: nothing presses back.
@@ -238,7 +243,7 @@ class Looks:
         return {"sign": sign, "stiffness": 2.0 * slope}
 
     def measured(self, job: Job, arm: int, lead: float) -> Measured:
-        """Return the numbers of an arm whose lag is compensated by a lead [s]."""
+        """Return the measured values of an arm whose commands are sent ahead by `lead` [s]."""
         late = self.late(job, arm)
         found = Measured(lead + late, late, self.speed(job, arm))
         if not self.forces[arm] or not self.pressed:
@@ -248,7 +253,8 @@ class Looks:
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """Add what a program does in place of the job."""
+    """Add the options for what a program does instead of the job: check, drive in the air, or
+    measure."""
     group = parser.add_mutually_exclusive_group()
     for name, text in (
         ("--check", "look at both arms and move nothing"),
@@ -261,12 +267,15 @@ def add_options(parser: ArgumentParser) -> None:
 def bring_up(
     folder: Path, job: Job, plan: dict[str, Any], drive: Callable[[Job, str], bool], looks: Looks
 ) -> int:
-    """Measure both arms and write what was found; return the exit code.
+    """Measure both arms and write the results. Return the exit code.
 
     Args:
-        folder: of the bundle.
-        plan: of its configuration.
-        drive: drives a job to its end and back, once somebody has said a word, and fills `looks`.
+        folder: folder of the bundle.
+        job: the job.
+        plan: planned values from the bundle's configuration.
+        drive: function that drives a job to its end and back after somebody has typed a word, and
+            fills `looks`.
+        looks: measurements.
 
     Raises:
         Refused: a measurement fails.
@@ -294,10 +303,10 @@ def bring_up(
 
 
 def require(folder: Path, job: Job, plan: dict[str, Any]) -> list[Measured]:
-    """Return what was measured of both arms.
+    """Return the measured values of both arms.
 
     Raises:
-        Refused: nothing was, or a number is not what the job was planned for.
+        Refused: nothing was measured, or a value differs too much from the plan.
     """
     first = f"python3 {plan['program']} --bring-up first; --in-air drives the job without a box"
     try:

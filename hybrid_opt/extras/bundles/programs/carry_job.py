@@ -22,34 +22,35 @@ HELD = ("lift", "carry", "set_down")
 """Phases in which pads alone hold the box."""
 
 SEARCH_STEP = 0.004
-"""Between places that are compared with a measured posture [s]."""
+"""Distance between places of the path that are compared with a measured posture [s]."""
 
 NEAR = 0.002
-"""A pad so near to its place is there [m]."""
+"""Largest distance of a pad from a place at which it counts as being there [m]."""
 
 PRESSED = 0.98
-"""Share of the force with which the box is lifted from which on the pads have to press."""
+"""Share of the force with which the box is lifted above which the pads have to press."""
 
 TOUCH = 0.005
-"""A box that is set down may stand so far above its planned place [m]."""
+"""Largest height above its planned place at which a box that is set down may already stand [m]."""
 
 
 class Refused(Exception):
-    """The job cannot begin or go on; the message says why."""
+    """The job cannot begin or continue; the message says why."""
 
 
 @dataclass(frozen=True)
 class Limits:
-    """When a job stops, from its file.
+    """Limits from the job's file at which the job is stopped.
 
     Attributes:
-        stop_time: from the planned speed to rest along the path [s].
-        quick_stop: the same for an arm that does not follow its commands [s].
-        start: largest distance of a pad from its first place [m].
+        stop_time: duration of a stop along the path from the planned speed [s].
+        quick_stop: duration of a stop if an arm does not follow its commands [s].
+        start: largest distance of a pad from its first position [m].
         path: largest distance of a pad from its path [m].
-        behind: how far an arm may lag behind its reference [s].
-        skew: how far both arms may be apart along the path [s].
-        force: share by which a measured force may miss its reference while the box is held.
+        behind: largest time that an arm may lag behind its reference [s].
+        skew: largest difference between both arms along the path [s].
+        force: largest deviation of a measured force from its reference while the box is held, as a
+            share.
         silence: largest age of a measurement [s].
         grip: longest wait for the inputs of hands [s].
     """
@@ -70,8 +71,8 @@ class Switch:
     """A phase in which hands are switched.
 
     Attributes:
-        begin, end: its coordinates [s].
-        on: what they are switched to on the way forward.
+        begin, end: coordinates of the phase [s].
+        on: True if the hands are switched on when the job runs forward.
     """
 
     begin: float
@@ -80,20 +81,20 @@ class Switch:
 
 
 class Job:
-    """A job from its file.
+    """A job read from its file.
 
     Attributes:
-        document: as it was read.
+        document: JSON values of the file.
         time: planned time of each sample [s].
-        robots: both arms' parts of the document.
-        limits: when to stop.
+        robots: each arm's part of the document.
+        limits: limits at which the job is stopped.
     """
 
     def __init__(self, document: dict[str, Any]) -> None:
-        """Take a document of this format.
+        """Store a document and check its format.
 
         Raises:
-            Refused: it is none, or of another version.
+            Refused: the document is not a job, or has another version.
         """
         if document.get("format") != FORMAT or document.get("version") != VERSION:
             raise Refused(f"this is no job of version {VERSION}")
@@ -113,10 +114,10 @@ class Job:
 
     @classmethod
     def read(cls, path: Path) -> Job:
-        """Read the job in a file.
+        """Read the job from a file.
 
         Raises:
-            Refused: it cannot be read.
+            Refused: the file cannot be read.
         """
         try:
             return cls(json.loads(path.read_text("utf-8")))
@@ -130,15 +131,16 @@ class Job:
 
     @property
     def end(self) -> float:
-        """The last coordinate [s]."""
+        """Last coordinate of the path [s]."""
         return self.time[-1]
 
     def phase(self, s: float) -> str:
-        """Return the phase at a coordinate."""
+        """Return the name of the phase at a coordinate [s]."""
         return next((name for last, name in self._phases if s <= last), self._phases[-1][1])
 
     def begin(self, name: str) -> float:
-        """Return the coordinate at which a phase begins; the last one if there is none."""
+        """Return the coordinate at which the phase with this name begins [s]; the last coordinate
+        if the job has no such phase."""
         first = 0.0
         for last, phase in self._phases:
             if phase == name:
@@ -147,7 +149,7 @@ class Job:
         return self.end
 
     def is_touching(self, s: float) -> bool:
-        """Return True if the box is so low in its set-down that it may stand."""
+        """Return True if the box is so low during its set-down that it may already stand."""
         if self.phase(s) != "set_down" or self.is_standing:
             return False
         places, (k, x, _) = self.document["box"]["pose"], self._place(s)
@@ -156,14 +158,15 @@ class Job:
         return math.dist(last, list(here)[:3]) <= TOUCH
 
     def stand(self, s: float, q: Sequence[Sequence[float] | None]) -> None:
-        """Move the release and what follows to a coordinate of the set-down, because the box stands
-        there.
+        """Shift the release and all later phases to a coordinate of the set-down, because the box
+        already stands there.
 
-        As the commanded forces fall, the arms' references move to where the arms are, so that those
-        which are soft let go as well.
+        While the commanded forces decrease, the references of the arms move to the measured
+        positions, so that soft arms release the box too.
 
         Args:
-            q: measured joint positions of each arm; None where there are none [rad, m].
+            s: coordinate of the set-down [s].
+            q: measured joint positions of each arm [rad or m]; None if unknown.
         """
         end, self._early = self.begin("release"), None
         ways = []
@@ -180,15 +183,16 @@ class Job:
 
     @cached_property
     def pressed(self) -> float:
-        """Coordinate from which the pads or hands alone hold the box."""
+        """Coordinate from which the pads or hands alone hold the box [s]."""
         return min(self.begin(name) for name in HELD)
 
     def is_gripped(self, s: float) -> bool:
-        """Return True if the pads touch the box before it is lifted."""
+        """Return True if the pads touch the box at a coordinate [s] before it is lifted."""
         return self._phases[0][0] < s <= self.pressed
 
     def grips(self, s: float, direction: float) -> bool:
-        """Return True if hands are switched on at a coordinate, on the way forward or back."""
+        """Return True if hands are switched on at a coordinate [s]. `direction` is 1 on the way
+        forward and -1 on the way back."""
         passed = [
             switch.on
             for switch in self.switches
@@ -197,17 +201,19 @@ class Job:
         return passed[-1] if passed else False
 
     def holds(self, s: float) -> bool:
-        """Return True if hands have to hold at a coordinate in either direction."""
+        """Return True if hands have to hold the box at a coordinate [s], in both directions."""
         return self.grips(s, 1.0) and self.grips(s, -1.0)
 
     def _place(self, s: float) -> tuple[int, float, float]:
-        """Return the sample before s, the share of its interval and the interval's length [s]."""
+        """Return the index of the sample before coordinate s [s], the share of the interval that is
+        passed, and the length of the interval [s]."""
         k = min(max(bisect_right(self.time, s) - 1, 0), len(self.time) - 2)
         step = self.time[k + 1] - self.time[k]
         return k, min(max((s - self.time[k]) / step, 0.0), 1.0), step
 
     def position(self, arm: int, s: float) -> list[float]:
-        """Compute the joint positions of an arm at a coordinate [rad, m]."""
+        """Return the joint positions of an arm at a coordinate [s], cubic between samples [rad or
+        m]."""
         k, x, step = self._place(s)
         q, v = self.robots[arm]["position"], self.robots[arm]["velocity"]
         a, b = (1.0 + 2.0 * x) * (1.0 - x) ** 2, x * (1.0 - x) ** 2 * step
@@ -224,43 +230,49 @@ class Job:
         return found
 
     def linear(self, arm: int, name: str, s: float) -> list[float]:
-        """Interpolate a list per sample of an arm linearly between samples."""
+        """Return values of an arm at a coordinate [s], linear between samples. `name` is the key of
+        the values in the arm's part of the document."""
         k, x, _ = self._place(s)
         rows = self.robots[arm][name]
         return [(1.0 - x) * a + x * b for a, b in zip(rows[k], rows[k + 1], strict=True)]
 
     def force(self, arm: int, s: float) -> float:
-        """Compute the commanded normal force of an arm [N]."""
+        """Return the commanded normal force of an arm at a coordinate s [s], in newtons."""
         k, x, _ = self._place(s)
         rows = self.robots[arm]["normal_force"]
         return float((1.0 - x) * rows[k] + x * rows[k + 1])
 
     def effort(self, arm: int, gravity: str, s: float, rate: float) -> list[float]:
-        """Compute the joint torques of an arm at a coordinate and rate [N m, N].
+        """Return the joint torques of an arm at a coordinate and rate [N m, for sliding joints N].
 
-        Efforts of the motion scale with the square of the rate, those that hold and press do not.
+        Torques of the motion scale with the square of the rate; torques that hold and press do not.
 
         Args:
+            arm: index of the arm.
             gravity: 'with_gravity' or 'without_gravity'.
+            s: coordinate [s].
+            rate: rate of the coordinate over time.
         """
         moving = self.linear(arm, f"effort_{gravity}", s)
         holding = self.linear(arm, f"hold_effort_{gravity}", s)
         return [b + (a - b) * rate * rate for a, b in zip(moving, holding, strict=True)]
 
     def distance(self, arm: int, q: Sequence[float], s: float) -> float:
-        """Bound the distance of a posture's pad from its place at a coordinate [m]."""
+        """Return an upper bound of the distance between the pad in a posture q and the pad's place
+        at coordinate s [m]."""
         reach = self.robots[arm]["reach"]
         planned = self.position(arm, s)
         return float(sum(r * abs(a - b) for r, a, b in zip(reach, q, planned, strict=True)))
 
     def speed(self, arm: int, s: float) -> float:
-        """Bound the speed of the pad at a coordinate [m/s]."""
+        """Return an upper bound of the speed of an arm's pad at coordinate s [m/s]."""
         rates = self.linear(arm, "velocity", s)
         reach = self.robots[arm]["reach"]
         return float(sum(r * abs(v) for r, v in zip(reach, rates, strict=True)))
 
     def _project(self, arm: int, q: Sequence[float], s: float) -> float:
-        """Fit the coordinate of an arm that is on its path by one step of Gauss and Newton [s]."""
+        """Return the coordinate of an arm on its path that is nearest to a posture q, by one
+        Gauss-Newton step from s [s]."""
         planned, rates = self.position(arm, s), self.linear(arm, "velocity", s)
         rows = zip(self.robots[arm]["reach"], q, planned, rates, strict=True)
         fit = [(r * r * (a - b) * v, r * r * v * v) for r, a, b, v in rows]
@@ -277,11 +289,16 @@ class Job:
         window: tuple[float, float],
         near: float = NEAR,
     ) -> float:
-        """Find the coordinate that fits a posture best, among equals the nearest to s [s].
+        """Return the coordinate that fits a posture best [s]; among equally good ones, the nearest
+        to s.
 
         Args:
-            window: how far from s it may be, before and behind [s].
-            near: a pad so near to its place at s is there [m].
+            arm: index of the arm.
+            q: measured joint positions [rad or m].
+            s: coordinate about which is searched [s].
+            window: how far the result may be before and behind s [s].
+            near: largest distance of the pad from its place at s with which s itself is returned
+                [m].
         """
         if self.distance(arm, q, s) <= near:
             return s

@@ -19,29 +19,30 @@ from dataclasses import dataclass, field
 from hybrid_opt.extras.bundles.programs.carry_job import HELD, PRESSED, Job, Refused
 
 STILL = 1e-9
-"""Rates below this are none."""
+"""Rates below this count as zero."""
 
 FINE = 0.002
 """Longest step over which a changing rate is integrated [s]."""
 
 SLOW = 0.25
-"""Share of the fastest speed below which a posture says too little of the coordinate to call an arm
-late."""
+"""Share of the fastest speed below which a posture determines the coordinate too inaccurately to
+detect a late arm."""
 
 SLOWEST = 0.1
-"""Least share of the quick stop's time in which slow arms stop."""
+"""Least duration of a stop of slow arms, as a share of the quick stop's duration."""
 
 UNLOADED = 0.07
-"""Largest force before the first contact, over the largest commanded one: an offset of the sensor
-becomes an error of the squeeze."""
+"""Largest measured force before the first contact, over the largest commanded force. A larger one
+is an offset of the sensor, which would become an error of the squeeze."""
 
 STRIKES = 3
-"""Consecutive checks with the same fault before a stop; a requested stop acts at once."""
+"""Number of successive checks with the same fault before a stop. A requested stop acts at once."""
 
 
 @dataclass(frozen=True)
 class Moment:
-    """The path at a time from now [s]: its coordinate, its rate, and the derivative of the rate."""
+    """State of the path at a future time: time from now, coordinate, rate, and derivative of the
+    rate."""
 
     time: float
     s: float
@@ -54,38 +55,40 @@ class Clock:
 
     Attributes:
         s: commanded coordinate of both arms [s].
-        rate: of s over time.
+        rate: derivative of s by time.
     """
 
     def __init__(self, end: float, stop_time: float, s: float = 0.0, rate: float = 0.0) -> None:
-        """Stand at a coordinate, or run through it."""
+        """Start at a coordinate, with a rate."""
         self.s, self.rate, self._stop_time = s, rate, stop_time
         self._low, self._high = 0.0, end
         self._takes = stop_time
         self._from, self._to, self._since = rate, rate, 0.0
 
     def keep(self, low: float, high: float) -> None:
-        """Keep the coordinate between two from now on [s]."""
+        """Limit the coordinate to a range from now on [s]."""
         self._low, self._high = low, high
 
     @property
     def turning(self) -> bool:
-        """True if the rate changes."""
+        """True while the rate changes."""
         return self._from != self._to
 
     def turn(self, rate: float, after: float = 0.0, takes: float | None = None) -> None:
-        """Change the rate smoothly.
+        """Start a smooth change of the rate.
 
         Args:
-            after: when it begins, from now [s].
-            takes: time of a change by one; the stop time by default [s].
+            rate: the new rate.
+            after: time until the change begins [s].
+            takes: duration of a change of the rate by one [s]; None for the stop time.
         """
         if rate != self._to:
             self._from, self._to, self._since = self.rate, rate, -after
             self._takes = self._stop_time if takes is None else takes
 
     def advance(self, dt: float) -> None:
-        """Advance time [s]; the coordinate does not depend on the number of calls."""
+        """Advance the time by dt [s]. The resulting coordinate does not depend on the number of
+        calls."""
         count = max(1, math.ceil(dt / FINE)) if self.turning else 1
         for _ in range(count):
             self._step(dt / count)
@@ -103,7 +106,7 @@ class Clock:
 
     @property
     def _share(self) -> float:
-        """Share of the change of the rate that is over."""
+        """Share of the change of the rate that is done."""
         return min(max(self._since / (self._takes * abs(self._to - self._from)), 0.0), 1.0)
 
     @property
@@ -116,7 +119,7 @@ class Clock:
         return sign * 30.0 * x * x * (1.0 - x) ** 2 / self._takes
 
     def ahead(self, rate: float, step: float) -> Iterator[Moment]:
-        """Yield each step from now on, turning to a rate, until it stands or has to."""
+        """Yield the future states in time steps, turning to a rate, until the clock stands."""
         clock = copy(self)
         clock.turn(rate)
         yield Moment(0.0, clock.s, clock.rate, clock.change)
@@ -130,15 +133,15 @@ class Clock:
 
 @dataclass
 class Seen:
-    """Measured state of the arms at a moment.
+    """Measured state of the arms at one time.
 
     Attributes:
-        q: measured joint positions of each arm; None if unknown [rad, m].
-        force: measured normal force of each pad; None if not measured [N].
-        age: time since each arm's posture was measured [s].
-        grip: input of each arm's hands: they hold; None if unknown.
-        fault: reason to stop; '' for none.
-        lost: the reason is an arm that does not follow its commands.
+        q: joint positions of each arm [rad or m]; None if unknown.
+        force: normal force of each pad [N]; None if not measured.
+        age: age of each arm's posture [s].
+        grip: for each arm, True if the input of its hands reports that they hold; None if unknown.
+        fault: reason to stop, '' for none.
+        lost: True if the reason is an arm that does not follow its commands.
     """
 
     q: list[list[float] | None] = field(default_factory=lambda: [None, None])
@@ -150,15 +153,17 @@ class Seen:
 
 
 class Machine:
-    """Runs a job: `ready`, `running`, `stopping`, `held`, `done`; `landing` stops where the box
-    stands before the end of its set-down, and goes on with the release there.
+    """Runs a job through the states `ready`, `running`, `stopping`, `held` and `done`. In the state
+    `landing` it stops where the box stands before the end of its set-down, and continues with the
+    release there.
 
     Attributes:
-        state: one of these.
-        reason: why it stopped last.
-        clock: of the path.
-        stop_time: of the stop that runs, or of the last one [s].
-        opened: the last look found that hands do what they were told, so that the clock goes on.
+        state: the present state.
+        reason: reason of the last stop.
+        clock: coordinate of the path.
+        stop_time: duration of the present stop, or of the last one [s].
+        opened: True if the last check found that the hands do what was commanded, so that the clock
+            continues.
     """
 
     def __init__(
@@ -172,10 +177,11 @@ class Machine:
         """Begin at the start of the job, at rest.
 
         Args:
+            job: the job.
             lag: delay of the arms behind their commands [s].
             lead: time from the decision to stop to its effect on the commands [s].
-            sensors: per arm, True if its force has to be measured.
-            inputs: per arm, True if something has to tell whether its hands hold.
+            sensors: per arm, True if its force must be measured.
+            inputs: per arm, True if an input must report whether its hands hold.
         """
         self.job, self.lag, self.lead, self._sensors = job, lag, lead, sensors
         self.state, self.reason = "ready", ""
@@ -188,8 +194,8 @@ class Machine:
         """Begin the job.
 
         Raises:
-            Refused: a stop is requested, an arm is silent or not at its first place, a sensor gives
-                no reading, or a pad is pressed.
+            Refused: a stop is requested, an arm is silent or not at its first position, a sensor
+                gives no reading, or a pad is pressed.
         """
         self.check(seen)
         self.state = "running"
@@ -197,7 +203,11 @@ class Machine:
         self._aim(1.0)
 
     def check(self, seen: Seen) -> None:
-        """Refuse arms that are not ready for the job; see `start`."""
+        """Check that the arms are ready for the job.
+
+        Raises:
+            Refused: they are not, for a reason that `start` names.
+        """
         if seen.fault:
             raise Refused(seen.fault)
         self._require_places(seen, self.job.limits.start)
@@ -214,15 +224,16 @@ class Machine:
                 )
 
     def hold(self, reason: str) -> None:
-        """Hold the present commanded posture, because the arms cannot go on."""
+        """Hold the present commanded posture because the arms cannot continue."""
         self.clock = Clock(self.job.end, self.job.limits.stop_time, self.clock.s)
         self.state, self.reason = "held", reason
 
     def resume(self, direction: float, seen: Seen) -> None:
-        """Resume from a hold: 1 to the end of the job, -1 back to its beginning.
+        """Continue after a stop: with direction 1 to the end of the job, with -1 back to its
+        beginning.
 
         Raises:
-            Refused: it is not held, an arm is silent or not where it is held.
+            Refused: the job is not held, or an arm is silent or not where it is held.
         """
         if self.state != "held":
             raise Refused(f"the job is {self.state}; it goes on only from where it is held")
@@ -237,11 +248,12 @@ class Machine:
 
     @property
     def grip(self) -> bool:
-        """True if the outputs of hands have to be on, once the job has begun."""
+        """True if the outputs of hands have to be on, as soon as the job has begun."""
         return self.job.grips(self.clock.s, self._direction)
 
     def _aim(self, direction: float) -> None:
-        """Set the places ahead at which the clock has to wait for the inputs of hands."""
+        """Determine the coordinates ahead at which the clock has to wait for the inputs of
+        hands."""
         self._direction, s, found = direction, self.clock.s, self.job.switches
         gates = [switch.end for switch in found if switch.end >= s]
         if direction < 0.0:
@@ -250,7 +262,7 @@ class Machine:
         self._next_gate()
 
     def _next_gate(self) -> None:
-        """Let the clock go as far as the next of these places."""
+        """Let the clock run to the next of these coordinates."""
         self._waited = 0.0
         low, high = 0.0, self.job.end
         if self._gates and self._direction > 0.0:
@@ -260,7 +272,7 @@ class Machine:
         self.clock.keep(low, high)
 
     def _wait(self, dt: float, seen: Seen) -> None:
-        """Wait for hands where the clock has to; go on when all that tell anything agree."""
+        """Wait for hands where the clock has to, and continue as soon as all inputs agree."""
         if self.clock.turning or self._gates[:1] != [self.clock.s]:
             return
         self._waited += dt
@@ -274,7 +286,7 @@ class Machine:
             self.hold(f"{self._grip(late[0], seen)} after {self.job.limits.grip:g} s")
 
     def tick(self, dt: float, seen: Seen) -> None:
-        """Advance the time and check the arms."""
+        """Advance the time by dt [s] and check the arms."""
         self.clock.advance(dt)
         self.opened = False
         limit = self.job.limits.silence
@@ -310,8 +322,8 @@ class Machine:
                 self.hold(str(error))
 
     def _lands(self, force: str) -> bool:
-        """Return True if a wrong force in the last part of the set-down means that the box stands;
-        stop there, unless the release begins sooner."""
+        """Return True if a wrong force in the last part of the set-down means that the box stands.
+        The arms then stop there, unless the release begins sooner."""
         if not self.job.is_touching(self.clock.s):
             return False
         # Slow arms can stop sooner, and press less until then.
@@ -331,7 +343,7 @@ class Machine:
             self.clock.turn(0.0, self.lead, self.stop_time)
 
     def told(self) -> str:
-        """Describe the state, and how to go on."""
+        """Return a text on the state, and on how to continue."""
         where = f"{self.job.phase(self.clock.s)}, {self.clock.s:.3f} s"
         if self.state == "landing":
             return f"the box stands in {where}: {self.reason}. Both arms let go of it there"
@@ -354,7 +366,7 @@ class Machine:
         return f"keep their hands switched {'on' if self.grip else 'off'}"
 
     def _grip(self, arm: int, seen: Seen) -> str:
-        """Tell what the input of an arm's hands says."""
+        """Return a text on the state that the input of an arm's hands reports."""
         if seen.grip[arm] is None:
             return f"nothing is heard of the input of {self._name(arm)}'s hands"
         return f"the hands of {self._name(arm)} {'hold' if seen.grip[arm] else 'do not hold'}"
@@ -374,7 +386,7 @@ class Machine:
                 )
 
     def _wrong(self, seen: Seen) -> str:
-        """Return the reason not to go on, or ''."""
+        """Return the reason why the job cannot continue, '' if it can."""
         limits, s = self.job.limits, self.clock.s
         # Nothing is lifted, and no job done, by an arm that stands elsewhere.
         stands = self.job.is_gripped(s) or s in (0.0, self.job.end)
@@ -415,7 +427,7 @@ class Machine:
         return ""
 
     def _wrong_force(self, seen: Seen) -> str:
-        """Return what the measured forces say against going on, or ''."""
+        """Return the reason why the measured forces do not allow to continue, '' if they do."""
         s, lift = self.clock.s, self.job.pressed
         for arm, measured in enumerate(seen.force):
             wanted = self.job.force(arm, s)

@@ -52,40 +52,43 @@ PATIENCE = 30.0
 """Longest wait for both controllers [s]."""
 
 LONGEST_TICK = 0.02
-"""At most so much of the job passes between two messages [s]: a pause of this computer does not
-make the arms jump."""
+"""Largest time by which the job advances between two messages [s], so that a pause of this computer
+does not make the arms jump."""
 
 KEPT = 250
-"""Ticks of the pressing pad that are kept: more than an arm's lag and the largest silence."""
+"""Number of stored positions of the pressing pad; they cover more than an arm's lag and the largest
+silence."""
 
 MOST_PRESSED = 1.2
-"""Measured over commanded force beyond which the pad goes no farther into the box."""
+"""Ratio of measured to commanded force above which the pad moves no farther into the box."""
 
 CREEP = 0.002
-"""Speed of the pressing pad while it is measured [m/s]."""
+"""Speed of the pressing pad while its stiffness is measured [m/s]."""
 
 CTRL_C = "Ctrl-C"
 
 
 class Press:
-    """Position of the pressing pad along its normal, from commanded and measured force.
+    """Controls the position of the pressing pad along its normal by the force.
 
     Attributes:
-        way: distance beyond the planned place, into the box [m].
+        way: distance beyond the planned position, into the box [m].
     """
 
     def __init__(self, config: dict[str, Any]) -> None:
-        """Begin at the planned place."""
+        """Start at the planned position."""
         self.way = 0.0
         self._missing = 0.0
         self._gain, self._most = config["gain"], config["most"]
         self._speed, self._compliance = config["speed"], config["compliance"]
 
     def tick(self, dt: float, wanted: float, soon: float, felt: float | None) -> None:
-        """Advance the time.
+        """Advance the time by dt [s].
 
         Args:
-            wanted, soon: commanded normal force now, and after the arm's lag [N].
+            dt: time step [s].
+            wanted: commanded normal force now [N].
+            soon: commanded normal force after the arm's lag [N].
             felt: measured force [N]; None before the first measurement.
         """
         if wanted <= 0.0:
@@ -100,7 +103,8 @@ class Press:
         self._move(target, self._speed * dt)
 
     def creep(self, dt: float, wanted: float, felt: float) -> None:
-        """Advance the time for an arm of unknown stiffness, by the sign of the error alone."""
+        """Advance the time by dt [s] for an arm of unknown stiffness: the pad moves at a constant
+        speed in the direction that reduces the error of the force."""
         self._move(self._most if felt < wanted else 0.0, CREEP * dt)
 
     def _move(self, target: float, step: float) -> None:
@@ -108,13 +112,15 @@ class Press:
 
 
 class Stream:
-    """Answers both controllers."""
+    """Answers the messages of both controllers."""
 
     def __init__(self, job: Job, config: dict[str, Any], known: Sequence[Measured] | Looks) -> None:
-        """Wait for both controllers.
+        """Prepare to wait for both controllers.
 
         Args:
-            known: what was measured of the arms, or looks that measure them.
+            job: the job.
+            config: settings of the bundle.
+            known: measured values of both arms, or a `Looks` that measures them.
         """
         self.job, self.config = job, config
         self.looks = known if isinstance(known, Looks) else None
@@ -154,7 +160,7 @@ class Stream:
         return Seen(q=q, force=force, age=age, fault=self.fault, lost=lost)
 
     def hear(self, arm: int, message: FromRobot, now: float) -> None:
-        """Process a message of an arm's controller."""
+        """Process a message of an arm's controller that arrived at time `now` [s]."""
         degrees = self._in_chain(arm, message.joints, message.further)
         if degrees is None:
             return
@@ -173,13 +179,14 @@ class Stream:
 
     @property
     def missing(self) -> str:
-        """Reason why the job cannot begin yet, or ''."""
+        """Reason why the job cannot begin yet, '' if it can."""
         if None in self._q:
             return "a controller is silent"
         return "" if all(self._follows) else self._not_following(self._follows.index(False))
 
     def read(self, arm: int, data: bytes, host: str) -> FromRobot | None:
-        """Read a packet; drop and count one that another host sent or that is damaged."""
+        """Decode a packet. Return None for a damaged packet or one from another host, and count
+        it."""
         if host == self._hosts[arm]:
             with suppress(ValueError, struct.error):
                 return read_robot(data)
@@ -187,12 +194,12 @@ class Stream:
         return None
 
     def told(self) -> str:
-        """Describe the state."""
+        """Return a text on the state."""
         strange = f" {self.dropped} packets were dropped, from other hosts or damaged."
         return self.machine.told() + (strange if self.dropped else "")
 
     def tick(self, now: float) -> None:
-        """Advance the time."""
+        """Advance the job to the time `now` [s]."""
         dt = 0.0 if self._last is None else min(now - self._last, LONGEST_TICK)
         self._last = now
         before = self.machine.state
@@ -233,7 +240,8 @@ class Stream:
             print(self.told(), file=sys.stderr)
 
     def answer(self, arm: int, number: int, now: float) -> bytes:
-        """Encode an arm's commanded position, its lag ahead of the clock, as a message."""
+        """Return the message with an arm's commanded position, taken ahead of the clock by the
+        arm's lag."""
         clock, first = self.machine.clock, self._first[arm]
         if self.machine.state == "ready" and first is not None:
             q = first
@@ -247,7 +255,8 @@ class Stream:
         return to_robot(number, now, joints, further)
 
     def _inward(self, s: float) -> list[float]:
-        """Compute the joints per motion of the pressing pad along its normal [rad/m]."""
+        """Return the motion of each joint per motion of the pressing pad along its normal
+        [rad/m]."""
         rows, time = self.config["inward"], self.job.time
         k = min(max(bisect_left(time, s) - 1, 0), len(rows) - 2)
         share = min(max((s - time[k]) / (time[k + 1] - time[k]), 0.0), 1.0)
@@ -256,7 +265,8 @@ class Stream:
     def _in_chain(
         self, arm: int, joints: Sequence[float], further: Sequence[float]
     ) -> list[float] | None:
-        """Return axes along the chain [degrees]: the third of seven is an external one to ABB."""
+        """Return axes in the order of the kinematic chain [degrees]. ABB counts the third of seven
+        as an external axis."""
         count = len(self.job.robots[arm]["joints"])
         if len(joints) < 6 or (count == 7 and not further):
             return None
@@ -271,7 +281,7 @@ class Stream:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Stream the job; returns the exit code: 0 when it is done."""
+    """Stream the job. Return the exit code, 0 when the job is done."""
     parser = argparse.ArgumentParser(description=__doc__)
     add_options(parser)
     options = parser.parse_args(arguments)
@@ -305,14 +315,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def streamed(
     stream: Stream, sockets: Sequence[socket.socket], check: bool = False, word: str = ""
 ) -> int:
-    """Answer both controllers until the job is done; returns the exit code.
+    """Answer both controllers until the job is done. Return the exit code.
 
     Args:
-        check: look at both arms and move nothing.
-        word: to be typed before the job begins.
+        stream: answers the messages.
+        sockets: socket of each controller.
+        check: True to check both arms without moving them.
+        word: word that somebody has to type before the job begins.
 
     Raises:
-        Refused: a controller does not begin, or an arm is not at its first place.
+        Refused: a controller does not begin, or an arm is not at its first position.
     """
 
     def interrupted(*_: object) -> None:
@@ -357,7 +369,7 @@ def streamed(
 
 
 def received(source: socket.socket) -> Iterator[tuple[bytes, Any]]:
-    """Yield the packets that wait in a socket, with their senders."""
+    """Yield the packets that wait in a socket, each with its sender's address."""
     with suppress(BlockingIOError):
         while True:
             yield source.recvfrom(4096, socket.MSG_DONTWAIT)
@@ -367,18 +379,18 @@ CORRECTION = 3
 """Type of a message to the controller."""
 
 RUNNING = 3
-"""State of EGM in which the controller follows."""
+"""State of EGM in which the controller follows commands."""
 
 
 @dataclass(frozen=True)
 class FromRobot:
-    """A message of a controller.
+    """A message from a controller.
 
     Attributes:
         number: of the message.
-        joints, further: axes of the robot, and external ones [degrees].
-        force: measured force [N] and moment; () without a sensor.
-        running: the controller follows commands.
+        joints, further: axes of the robot, and external axes [degrees].
+        force: measured force [N] and moment; empty without a sensor.
+        running: True if the controller follows commands.
     """
 
     number: int
@@ -389,10 +401,10 @@ class FromRobot:
 
 
 def read_robot(data: bytes) -> FromRobot:
-    """Decode a message of a controller.
+    """Decode a message from a controller.
 
     Raises:
-        ValueError: the bytes are none.
+        ValueError: the bytes are not such a message.
     """
     number, running = 0, False
     joints: tuple[float, ...] = ()
@@ -444,7 +456,8 @@ def _doubles(data: bytes, numbers: tuple[int, ...]) -> tuple[float, ...]:
 
 
 def _fields(data: bytes) -> Iterator[tuple[int, int | bytes]]:
-    """Yield fields with their numbers: varints as numbers, everything else as bytes."""
+    """Yield the fields of a message with their numbers: varints as integers, all others as
+    bytes."""
     place = 0
     while place < len(data):
         key, place = _varint(data, place)

@@ -52,24 +52,25 @@ from hybrid_opt.extras.bundles.programs.carry_machine import Machine, Moment, Se
 BUNDLE = Path(__file__).resolve().parent
 
 PERIOD = 0.01
-"""Between two looks at the arms [s]."""
+"""Time between two checks of the arms [s]."""
 
 LEAD = 0.5
-"""From building the goals to their common start [s]."""
+"""Time from the construction of the goals to their common start [s]."""
 
 PATIENCE = 10.0
-"""Longest wait for something of the controllers [s]."""
+"""Longest wait for an answer of the controllers [s]."""
 
 LEAD_OF_STOP = 0.04
-"""From the decision to stop to when the arms leave their course [s]: time for the message."""
+"""Time from the decision to stop until the arms leave their course [s], which the message needs."""
 
 SETTLE = 0.5
-"""To hear from both arms, before the first look [s]."""
+"""Time to receive messages of both arms before the first check [s]."""
 
 CTRL_C = "Ctrl-C"
 
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
-"""Of measurements: hears reliable publishers and those of best effort, keeps no queue."""
+"""Quality of service for measurements: accepts reliable and best-effort publishers, and keeps no
+queue."""
 
 
 def parts(time: float) -> tuple[int, int]:
@@ -84,10 +85,10 @@ def type_of(kind: str) -> Any:
 
 
 def fill(message: Any, values: dict[str, Any]) -> None:
-    """Set fields of a message.
+    """Set the fields of a message from a dictionary.
 
     Raises:
-        AttributeError: it has no such field.
+        AttributeError: the message has no such field.
     """
     for name, value in values.items():
         if isinstance(value, dict):
@@ -102,10 +103,13 @@ class Run:
     def __init__(
         self, node: Any, job: Job, config: dict[str, Any], known: Sequence[Measured] | Looks
     ) -> None:
-        """Subscribe to both arms, with nothing sent.
+        """Subscribe to both arms; nothing is sent yet.
 
         Args:
-            known: what was measured of the arms, or looks that measure them.
+            node: ROS node.
+            job: the job.
+            config: content of config/cell.json.
+            known: measured values of both arms, or a `Looks` that measures them.
         """
         self.node, self.config = node, config
         self.looks = known if isinstance(known, Looks) else None
@@ -138,7 +142,7 @@ class Run:
         ]
 
     def take(self, job: Job) -> None:
-        """Take a job, to be begun."""
+        """Store a job to be run next."""
         sensors = [source is not None and self.looks is None for source in self.config["wrench"]]
         inputs = [bool(grip and grip["input"]) for grip in self._grips]
         self.job = job
@@ -152,7 +156,8 @@ class Run:
                 self._measured[arm] = self._stamp(message)
 
     def _stamp(self, message: Any) -> float:
-        """Return when a message was measured [s]; its arrival where it bears no stamp."""
+        """Return the time at which a message was measured [s], or the time of arrival if it has no
+        stamp."""
         stamp = message.header.stamp
         return stamp.sec + 1e-9 * stamp.nanosec or self.now()
 
@@ -182,7 +187,8 @@ class Run:
         self.node.create_subscription(type_of(source["kind"]), source["topic"], heard, NEWEST)
 
     def _switch(self) -> None:
-        """Switch the hands where the job does; a refusal becomes a fault when it arrives."""
+        """Switch the hands where the job requires it. A refusal is reported as a fault when it
+        arrives."""
         if self.machine.grip == self._switched:
             return
         self._switched = self.machine.grip
@@ -223,7 +229,7 @@ class Run:
         )
 
     def _normal_force(self, arm: int, now: float) -> float | None:
-        """Return a pad's measured normal force [N]; while it is measured, none."""
+        """Return a pad's measured normal force [N]; None while the arms are being measured."""
         raw = self._raw(arm, now)
         return None if raw is None or self._signs is None else self._signs[arm] * raw
 
@@ -236,10 +242,10 @@ class Run:
             rclpy.spin_once(self.node, timeout_sec=left)
 
     def wait(self, futures: Sequence[Any], what: str) -> list[Any]:
-        """Return the results of futures.
+        """Wait for futures and return their results.
 
         Raises:
-            Refused: they take too long.
+            Refused: they take longer than `PATIENCE`.
         """
         begin = self.now()
         while not all(future.done() for future in futures):
@@ -249,13 +255,16 @@ class Run:
         return [future.result() for future in futures]
 
     def call(self, name: str, kind: str, requests: Sequence[dict[str, Any]]) -> Any:
-        """Call a service; a refusal becomes a fault when it arrives.
+        """Call a service. A refusal is reported as a fault when it arrives.
 
         Args:
-            requests: the same one as versions of the driver define it; the first that fits is sent.
+            name: name of the service.
+            kind: type of the service.
+            requests: the same request in the forms of several versions of the driver; the first
+                form that fits is sent.
 
         Raises:
-            Refused: none fits.
+            Refused: no form fits.
         """
         for request in requests:
             message = type_of(kind).Request()
@@ -271,17 +280,16 @@ class Run:
         return future
 
     def _find(self, name: str, kind: str) -> None:
-        """Find a service before anything moves."""
+        """Find a service, so that a missing one is noticed before anything moves."""
         self._clients[name] = self.node.create_client(type_of(kind), name)
         if not self._clients[name].wait_for_service(timeout_sec=PATIENCE):
             raise Refused(f"{name} is not there; are the controllers launched?")
 
     def prepare(self) -> None:
-        """Prepare the arms: check them, then call the services that config/cell.json lists, in its
-        order.
+        """Check the arms, then call the services that config/cell.json lists, in this order.
 
         Raises:
-            Refused: a service is missing or refuses, or an arm is not at its first place.
+            Refused: a service is missing or refuses, or an arm is not at its first position.
         """
         for group, client in zip(self.config["groups"], self._actions, strict=True):
             if not client.wait_for_server(timeout_sec=PATIENCE):
@@ -295,10 +303,10 @@ class Run:
                 raise Refused(self.fault)
 
     def check(self) -> None:
-        """Look at both arms.
+        """Check that both arms are ready for the job.
 
         Raises:
-            Refused: they are not ready for the job.
+            Refused: an arm is not ready.
         """
         while self.now() == 0.0:
             # A simulator's clock is not there yet.
@@ -307,9 +315,10 @@ class Run:
         self.machine.check(self.seen())
 
     def send(self, moments: Sequence[Moment], begin: float) -> None:
-        """Send every group its part of the path, and wait until it is accepted.
+        """Send each controller its part of the path, and wait until it is accepted.
 
         Args:
+            moments: the path.
             begin: time of the first point [s].
 
         Raises:
@@ -349,7 +358,8 @@ class Run:
         return FollowJointTrajectory.Goal(trajectory=trajectory)
 
     def _joined(self, arms: Sequence[int], rows: Sequence[Sequence[Any]]) -> list[Any]:
-        """Stack values of arms' joints; of a joint that moves both arms, take the first's."""
+        """Return the values of several arms' joints in one list per row; a joint that moves both
+        arms is taken from the first."""
         found: dict[str, Any] = {}
         for arm, row in zip(arms, rows, strict=True):
             for name, value in zip(self.job.robots[arm]["ros_joints"], row, strict=True):
@@ -371,10 +381,10 @@ class Run:
         )
 
     def start(self) -> None:
-        """Send the whole job and begin.
+        """Send the whole job and start it.
 
         Raises:
-            Refused: the arms are not ready for it.
+            Refused: the arms are not ready.
         """
         self.machine.start(self.seen())
         self._begin(1.0)
@@ -394,7 +404,7 @@ class Run:
         self._last = self._began
 
     def tick(self) -> None:
-        """Check the arms and react."""
+        """Check the arms, and stop them or advance the job."""
         machine = self.machine
         before, now, seen = machine.state, self.now(), self.seen()
         machine.tick(now - self._last, seen)
@@ -414,7 +424,7 @@ class Run:
             self._resume(1.0 if self.command == "continue" else -1.0)
 
     def stop(self, reason: str) -> None:
-        """Stop for the caller's reason."""
+        """Stop the arms along the path for a reason that the caller states."""
         if self.machine.state == "running":
             self.machine.stop(reason)
             self._stop()
@@ -434,7 +444,8 @@ class Run:
             self.node.get_logger().error(f"{error}; its arm goes on as it was last told")
 
     def drive(self, part: Job, word: str) -> bool:
-        """Drive a part of the job to its end and back, once somebody has said a word."""
+        """Drive a part of the job to its end and back, after somebody has typed a word. Return True
+        if it was done."""
         self.take(part)
         self.node.get_logger().info(BLOCK if word else AIR)
         while self.command != word and not self.fault:
@@ -465,13 +476,13 @@ class Run:
             self.node.get_logger().error(self.machine.told())
 
     def interrupt(self, *_: object) -> None:
-        """On Ctrl-C stop the job; while it is held, end the program."""
+        """Stop the job on Ctrl-C; if the job already holds, end the program."""
         if self.machine.state == "held":
             self.command = "leave"
         self.fault = self.fault or CTRL_C
 
     def look_after(self) -> int:
-        """Supervise a run that has begun until its end; return the exit code."""
+        """Supervise the started job until it ends. Return the exit code."""
         machine = self.machine
         try:
             while machine.state != "done":
@@ -487,7 +498,7 @@ class Run:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the job; returns the exit code: 0 when it is done."""
+    """Run the job. Return the exit code, 0 when the job is done."""
     parser = argparse.ArgumentParser(description=__doc__)
     add_options(parser)
     options = parser.parse_args(arguments)
