@@ -112,7 +112,8 @@ class Agreement:
 
     @property
     def agrees(self) -> bool:
-        """True if both are within `AGREEMENT_TOLERANCE`."""
+        """True if the worst differences of outputs and of derivatives are within
+        `AGREEMENT_TOLERANCE`."""
         return max(self.outputs, self.derivatives) <= AGREEMENT_TOLERANCE
 
 

@@ -167,7 +167,13 @@ class Carry(Displayable):
 
     @property
     def payload_limit(self) -> float:
-        """Least payload at which a robot's whole force reaches its reference force [kg]."""
+        """Least payload mass at which a robot's force reaches its reference force on the same
+        motion [kg].
+
+        All forces grow in proportion to the mass. The force of a pad is the magnitude of its
+        contact force, friction included; the force of hands that grip on their own is their normal
+        force.
+        """
         forces = self.peak_normal_force, self.peak_resultant_force
         return payload_limit(self.workcell, limited_force(self.workcell, *forces))
 

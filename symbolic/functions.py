@@ -277,12 +277,15 @@ def sample_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def kernel_numbers(workcell: Workcell, screen: Screen) -> dict[str, tuple[str, ...]]:
-    """Return, for each function of `kernel_functions` by name, the names of the parameter groups
-    that it takes after its other inputs, in order.
+    """Return which groups of the cell's parameters each function of `kernel_functions` takes.
 
     Args:
         workcell: the cell, with symbolic parameters.
         screen: the parameters of its distance bounds, symbolic too.
+
+    Returns:
+        For each name of a function the names of the groups, in the order of the function's last
+        inputs.
     """
     arms, held = tuple(sx_parameters(*workcell.robots)), tuple(sx_parameters(workcell.payload))
     bodies = tuple(sx_parameters(screen))

@@ -53,16 +53,18 @@ redundant joints."""
 
 
 def path_function(model: CellModel, samples: int) -> ca.Function:
-    """Return the path's variables x (n_path,) -> box and arms at uniform samples of u in [0, 1].
+    """Build the function that computes box and arms along a path, at n uniform samples of u.
 
-    Outputs (NumPy shapes, n samples): those of `PATH_OUTPUTS`: the extended pose and its
-    derivatives by u (n, 6 + m), and both arms' joints (n, joints of the arm); then per arm i = 1, 2
-    ik_residual_i, lost_i, limit_margin_i, manipulability_i (n,) as in
-    `symbolic.robot.arm.TRACK_OUTPUTS`.
+    Input: x (n_path,), the path's variables [m, rad]; then the parameters of the cell.
+
+    Outputs (NumPy shapes): pose, pose_first, pose_second (n, 6 + m), the box pose with the m
+    redundant joints [m, rad] and its first and second derivative by u; q_1, q_2 (n, joints), joint
+    positions [rad or m]; then for each arm i = 1, 2 ik_residual_i, lost_i, limit_margin_i and
+    manipulability_i (n,), explained in `symbolic.robot.arm.TRACK_OUTPUTS`.
 
     Args:
         model: the cell.
-        samples: number of samples, at least 3.
+        samples: number n of samples from u = 0 to u = 1, at least 3.
     """
     workcell = model.workcell
     x, task = ca.MX.sym("x", workcell.task.n_path), workcell.task

@@ -400,14 +400,17 @@ def build_study(cell: Cell, progress: Progress, polish: bool = True, drivable: b
 
 
 def build_all(makers: Sequence[Maker], progress: Progress) -> list[DualArmError]:
-    """Load or build functions in parallel. The first caller of functions that could not be built
-    reports the failure.
+    """Load or build functions in parallel.
 
-    Ctrl-C ends all compilers. Finished libraries are kept; threads that build expressions are not
-    waited for.
+    A function that cannot be built raises no error here, but where it is called first. Ctrl-C ends
+    all compilers. Finished libraries are kept; threads that build expressions are not waited for.
+
+    Args:
+        makers: functions without arguments, each of which loads or builds compiled functions.
+        progress: display of the number of finished makers.
 
     Returns:
-        Errors of failed builds.
+        Errors of the makers that failed, in the order of `makers`.
     """
     # Each waits for its compilers most of the time; expressions are made by one after the other.
     pool = ThreadPoolExecutor(len(makers))

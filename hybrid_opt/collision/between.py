@@ -170,7 +170,12 @@ class _Sweep:
         return Intervals(index, start, width, a, b, *self.checker.motion(*ends), pending)
 
     def _uncleared(self, work: Intervals) -> Intervals:
-        """Return the intervals in which the motion bound leaves a pair open."""
+        """Return the intervals that still have a pair without a proof of its clearance.
+
+        A pair is proven clear in an interval if its clearances at both ends, less the longest way
+        that its bodies can move in between, exceed the required clearance. Proven pairs are no
+        longer `pending`.
+        """
         c_a, c_b = work.a.clearance, work.b.clearance
         halfway = c_a + c_b
         halfway -= work.chord

@@ -100,10 +100,11 @@ def joint_tables(geometry: CellGeometry) -> tuple[JointTable, ...]:
 
 
 def _in_root(body: CollisionBody, arm: ArmGeometry) -> tuple[Piece, ...]:
-    """Return the pieces of a link in the link's frame; of a body fixed to the world in the frame of
-    the arm's root.
+    """Return the pieces of a body as seen by an arm.
 
-    The place of the arm in the cell changes these poses only in their last digits.
+    Pieces of a link stay in the link's frame. Pieces of a body fixed to the world are moved into
+    the frame of the arm's root. Their poses are rounded there, so that a table does not depend on
+    the place of the arm in the cell.
     """
     if body.frame != WORLD:
         return body.pieces

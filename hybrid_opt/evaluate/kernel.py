@@ -87,12 +87,17 @@ def evaluate_numpy(outputs: Mapping[str, Array], checker: CollisionChecker) -> S
 
 
 def reached_samples(outputs: Mapping[str, Array], row: int) -> tuple[Array, Array, Array]:
-    """Return box poses and joints of both arms at the samples of a candidate before an arm loses
-    the path. Only these can collide.
+    """Return the motion of a candidate up to the sample at which the first arm loses the path.
+
+    Only these k samples are checked for collisions.
 
     Args:
-        outputs: per-sample outputs of the candidate function.
-        row: index of the candidate.
+        outputs: per-sample outputs of the candidate function for a batch of candidates.
+        row: index of the candidate in the batch.
+
+    Returns:
+        Box poses (k, 6) [m, rad]; joint positions (k, joints) of the first and of the second arm
+        [rad or m].
     """
     lost = (outputs["lost_1"][row] > 0.0) | (outputs["lost_2"][row] > 0.0)
     reached = int(np.argmax(lost)) if lost.any() else len(lost)
@@ -257,7 +262,14 @@ class Kernel:
         return found
 
     def _judged(self, left: NDArray[np.void]) -> NDArray[np.bool_]:
-        """Decide open pairs, at least one, by the checker: True for collisions."""
+        """Decide by the collision checker which of n pairs collide.
+
+        Args:
+            left: (n,) records `open_pair` that the compiled bounds could not decide, at least one.
+
+        Returns:
+            (n,) True for pairs in collision.
+        """
         configuration = self._checker.split(left["configuration"])
         return self._checker.collisions(*configuration, np.arange(len(left)), left["pair"])
 

@@ -181,11 +181,14 @@ def _fastest(driven: Callable[[float], _Slowdown]) -> _Slowdown:
 
 
 def _between(slow: _Slowdown, fast: _Slowdown) -> float:
-    """Interpolate between two factors to the one at which the most exceeded limit is just fully
-    used.
+    """Estimate the factor at which the most exceeded limit is just fully used.
 
-    Accelerations, forces and torques are nearly affine in the square of the factor, so one guess is
-    nearly enough.
+    The estimate is linear in the square of the factor: accelerations, forces and torques are nearly
+    affine in it.
+
+    Args:
+        slow: timing with a factor that satisfies the limits.
+        fast: timing with a larger factor that exceeds a limit.
     """
     low, high, least = slow.columns, fast.columns, 1.0 - _UNUSED / 2.0
     beyond = (high > least) & (high > low)

@@ -182,8 +182,9 @@ class RobustModel:
     def __init__(
         self, workcell: Workcell, load: Callable[..., NumericFunction] = contact_function
     ) -> None:
-        """Load or build the functions of pads with a scalar squeeze. Functions of other pads are
-        built on first use.
+        """Load or build the compiled functions that compute robust forces.
+
+        They are loaded at once if the contact model has a scalar squeeze, else on first use.
 
         Args:
             workcell: the workcell.

@@ -99,8 +99,13 @@ class PathLimits:
         return np.concatenate(columns, axis=1)
 
     def ratio_slopes(self, ratios: Array, a: Array, w: Array) -> Array:
-        """Compute the slopes (n, k, 2) of `ratios` by (u'', u'^2) at a and w by forward
-        differences."""
+        """Compute the derivatives (n, k, 2) of the method `ratios` by u'' and by u'^2, by forward
+        differences.
+
+        Args:
+            ratios: (n, k) result of the method at a and w.
+            a, w: (n,) values of u'' [1/s^2] and u'^2 [1/s^2].
+        """
         step_a = 1e-5 * max(float(np.abs(a).max()), 1e-6)
         step_w = 1e-5 * max(float(w.max()), 1e-6)
         by_a = (self.ratios(a + step_a, w) - ratios) / step_a

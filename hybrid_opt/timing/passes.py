@@ -67,7 +67,12 @@ class ForwardBackwardPasses:
     """
 
     def __init__(self, compiled: CompiledCell, intervals: int, threads: int = 1) -> None:
-        """Load or build the passes. `threads` threads share a batch of paths.
+        """Load or build the compiled backward and forward pass over a path.
+
+        Args:
+            compiled: the workcell with its compiled functions.
+            intervals: number of intervals of constant path acceleration.
+            threads: number of threads that share a batch of paths.
 
         Raises:
             DualArmError: the code cannot be built.

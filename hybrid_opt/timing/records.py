@@ -212,7 +212,8 @@ class Validation:
 
     @property
     def is_confirmed(self) -> bool:
-        """Return True if both durations agree within `AGREEMENT`."""
+        """Return True if the duration of the timing differs from TOPP-RA's by at most the share
+        `AGREEMENT`."""
         return abs(self.ratio - 1.0) <= AGREEMENT
 
 

@@ -176,8 +176,16 @@ class _CuttingPlaneProblem:
         return a / self._scale, w.reshape(-1) / self._scale**2
 
     def _advance(self, squared: Array) -> bool:
-        """Add or renew rows about a timing. Return True if it satisfies the limits and has
-        settled."""
+        """Prepare the next linear problem: cut off a timing that exceeds convex limits, and
+        linearise the other limits about it.
+
+        Args:
+            squared: (intervals + 1,) squared speeds of the timing in the scaled path coordinate.
+
+        Returns:
+            True if the timing satisfies the limits and, where limits are linearised, its duration
+            no longer changes.
+        """
         a, w = self._at_points(squared)
         excess = self._cut(a, w)
         ratios = self._at.ratios(a, w)
@@ -199,8 +207,15 @@ class _CuttingPlaneProblem:
         return excess <= POINT_TOLERANCE and change <= SETTLED_CHANGE
 
     def _cut(self, a: Array, w: Array) -> float:
-        """Add supporting lines of the convex limits that a timing exceeds. Return the largest
-        excess."""
+        """Add supporting lines, tangent at a timing, of the convex limits that this timing exceeds.
+
+        Args:
+            a, w: (points,) u'' [1/s^2] and u'^2 [1/s^2] of the timing.
+
+        Returns:
+            The largest excess over a convex limit, as a share of the limit; negative if none is
+            exceeded.
+        """
         worst_excess = -1.0
         for first, second, limit in self._at.accelerations():
             vector = first * a[:, None] + second * w[:, None]

@@ -208,8 +208,12 @@ LATE = 0.5
 
 
 def histories(data: ReportData) -> Figure:
-    """Draw the best feasible value of each objective so far, in the same runs; the inset enlarges
-    the second half (paper Figure 8)."""
+    """Draw how the search improves the objectives (paper Figure 8).
+
+    The curves show the best feasible value so far of the first two objectives over the number of
+    evaluated candidates, for the representative replica of each algorithm. An inset enlarges the
+    second half.
+    """
     figure = new_figure(0.5)
     axes = figure.subplots()
     inset = axes.inset_axes((0.42, 0.47, 0.56, 0.46))

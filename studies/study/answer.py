@@ -85,9 +85,9 @@ def carry_text(duration: float, force: float, job_duration: float, order: str) -
     """Return a carry in one line of text.
 
     Args:
-        duration: of the carry [s].
-        force: the largest normal force to command of the force-controlled arm [N].
-        job_duration: of the whole job [s]; NaN, without a job, is left out.
+        duration: duration of the carry [s].
+        force: largest commanded normal force of the force-controlled arm [N].
+        job_duration: duration of the whole job [s]; NaN if there is no job, then it is left out.
         order: words before the force, as 'press with'.
     """
     job = f", the whole job {seconds(job_duration)}" if math.isfinite(job_duration) else ""

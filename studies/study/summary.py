@@ -259,9 +259,12 @@ class CampaignSummary:
 
     @property
     def shown_files(self) -> dict[str, Path]:
-        """Files of the trajectories that a report shows, relative to the folder of selected
-        trajectories and to that of timings: the hand-made one under the key '', the best of each
-        algorithm under the algorithm's name."""
+        """File paths of the trajectories that a report shows, by algorithm.
+
+        These are the best trajectory of each algorithm that has one and, under the key '', the
+        hand-made trajectory. Each path is relative: it names the trajectory in `selected/` and its
+        timing in `timing/`.
+        """
         best = {
             name: entry.replicas[entry.representative]
             for name, entry in self.algorithms.items()

@@ -82,7 +82,8 @@ class ConvexProgram(Protocol):
 
     @property
     def given(self) -> dict[str, ca.SX]:
-        """Symbolic parameters in the formulas, by group. They follow the inputs of `cell_sizes`."""
+        """Symbolic parameters of the cell in the program's formulas, by name of their group.
+        Compiled functions take them after the inputs `cell_sizes`."""
 
     def free(self, wrenches: list[ca.SX]) -> ca.SX:
         """Select the free components from all wrenches; the load determines the other

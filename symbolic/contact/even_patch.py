@@ -113,8 +113,15 @@ class LocalEven:
     """
 
     def __init__(self, patch: EvenPatch, iterate: ca.SX) -> None:
-        """Compute the barrier's derivatives. The weight is at least the weight that the multipliers
-        imply."""
+        """Compute the barrier's derivatives at an iterate, and the weight that steps use.
+
+        This is the weight of the iterate or, if larger, the product of state and multipliers over
+        `DEGREE`.
+
+        Args:
+            patch: the patch.
+            iterate: (9,) state, multipliers and weight.
+        """
         self.patch = patch
         self.state, self.multiplier, weight = ca.vertsplit(
             iterate, [0, len(EVEN), 2 * len(EVEN), patch.iterate_size]

@@ -167,8 +167,11 @@ class Grasp:
 
     @cached_property
     def _at_rest(self) -> tuple[ca.SX, ca.SX]:
-        """States (n,) on the central path under the load at rest, and their derivatives (n, 6) by
-        the load."""
+        """States of all patches, one after the other (n,), at the load at rest, and their
+        derivatives (n, 6) by the load.
+
+        These states balance the load and lie on the program's central path.
+        """
         numbers = self.numbers if self.numbers.rest is not None else self.complete()
         return ca.SX(number(numbers.rest)), ca.SX(number(numbers.rest_slopes))
 

@@ -267,8 +267,17 @@ class HoldingHands(ContactModel):
     def commanded_forces(
         self, normal: Expression, friction: Expression, tracking: Expression, opposed: Expression
     ) -> Expression:
-        """Return the holding force (2,) that both arms need [N], equal for both. Part of the
-        holding force, for example of a vacuum, may be missing."""
+        """Return the holding force (2,) that each arm's hands need [N]. Both entries are equal.
+
+        The force is stated for the weaker hands.
+
+        Args:
+            normal: (2,) least holding force of each arm's hands [N].
+            friction: (2,) Coulomb coefficients.
+            tracking: (2,) share of each arm's holding force that may be missing, for example of a
+                vacuum.
+            opposed: force with which the arms may work against each other [N].
+        """
         needed = ca.fmax(normal[0], normal[1]) + opposed * self._opposed_need(friction)
         needed /= 1.0 - ca.fmax(tracking[0], tracking[1])
         return ca.vertcat(needed, needed)

@@ -155,7 +155,12 @@ class _Local:
         return self._with_g(self._equations.constrained(self._loaded))
 
     def _with_g(self, found: ca.SX) -> ca.SX:
-        """Add the term g g' to solutions (n, k) without it, by the Sherman-Morrison formula."""
+        """Correct solutions for the part -g g' of the curvature by the Sherman-Morrison formula. g
+        is the gradient of log effort.
+
+        Args:
+            found: (n, k) solutions of the equations without this part.
+        """
         return found + ca.mtimes(self._answer, self._share * ca.mtimes(self._g.T, found))
 
     def third(self, along: ca.SX, by_load: ca.SX) -> ca.SX:

@@ -93,11 +93,13 @@ def cut(mesh: trimesh.Trimesh, path: Path) -> CutMesh:
 
 
 def _may_be_cut(triangles: Array, filled: float) -> bool:
-    """Return False if `decompose` would leave a component whole, however its holes are closed.
+    """Return True if `decompose` might cut a component that has holes, once these were closed.
 
-    What closes the holes only enlarges the hulls of both halves of a cut.
+    The result False is certain: triangles that close a hole only enlarge the hulls of both halves
+    of a cut.
 
     Args:
+        triangles: (n, 3, 3) corners of the component's triangles [m].
         filled: volume of the component's hull [m^3].
     """
     if np.all(np.ptp(triangles, axis=(0, 1)) <= SMALL_PART):
@@ -332,7 +334,7 @@ class _Growth:
         self.preimage = self._stretched(corners, 1.0 / self._factors)
 
     def moved(self, points: Array) -> Array:
-        """Map points (n, 3)."""
+        """Apply the map to points (n, 3) in the frame of the hull [m]."""
         return self._stretched(points, self._factors)
 
     def hull_contains(self, points: Array) -> bool:

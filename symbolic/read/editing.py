@@ -179,8 +179,12 @@ def _cut_heading(place: Any) -> list[Any]:
 
 
 def _last_body(place: Any) -> list[Any]:
-    """Return the (key, item) pairs of a table's last part; comments and blank lines have the key
-    None. Empty for an inline table, and for a table written in several places."""
+    """Return the body of the innermost table at the end of a tomlkit item's text.
+
+    The body is the table's own list of (key, item) pairs in the order of the file; comments and
+    blank lines have the key None. The list is empty if the item is an inline table, a table written
+    in several places, or no table.
+    """
     if isinstance(place, AoT):
         return _last_body(place[-1]) if len(place) else []
     if not isinstance(place, Table | tomlkit.TOMLDocument):

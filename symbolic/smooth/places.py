@@ -127,7 +127,12 @@ class PathConstraint(ABC):
 
     @abstractmethod
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Return the value at a place, given the parameters (n,) of a member of the family."""
+        """Build the expression of the constrained value [m, rad or 1], a scalar.
+
+        Args:
+            place: symbols of the box pose and the joints at one place of the path.
+            numbers: (count,) symbolic parameters, which distinguish the members of the family.
+        """
 
     def count(self, place: PathPointSymbols) -> int:
         """Return the number of parameters of a member of the family."""

@@ -83,8 +83,10 @@ class Gap:
 def chosen_step(
     job: Job, steps: Sequence[float], interpolation: Interpolation, stiffness: float
 ) -> float:
-    """Return the longest time step with which the error of the normal forces stays within the
-    tracking share.
+    """Return the longest time step [s] with which the pads' forces stay near the commanded ones.
+
+    Between two samples the pads miss their distance, which changes the normal forces. A step is
+    accepted if this error is at most the share `TRACKED` of the least commanded force.
 
     Args:
         job: the job.

@@ -90,7 +90,13 @@ class PressedBox(HeldBox):
     corrected."""
 
     def __init__(self, mujoco: ModuleType, model: Any, data: Any, workcell: Workcell) -> None:
-        """Find the contact points of the pads too."""
+        """Find the box, the pads and the contact points of each pad in a model.
+
+        Args:
+            mujoco: the imported module.
+            model, data: MuJoCo's model of the cell, from `cell_text`, and its state.
+            workcell: the cell.
+        """
         super().__init__(model, data, workcell)
         self._mujoco, self._model = mujoco, model
         self._bodies = [int(model.site_bodyid[site]) for site in self.sites]

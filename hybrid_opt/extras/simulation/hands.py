@@ -255,8 +255,14 @@ class HeldInHands:
         self._settled: tuple[Array, Array] | None = None
 
     def look(self) -> tuple[Array, Array, float]:
-        """Measure, since the first call, the largest slip (2,) of each robot's hands along their
-        patches [m], the largest lift (2,) off a rim [m], and the rotation [rad]."""
+        """Measure how far the payload has moved in the hands.
+
+        Returns:
+            Slip (2,): largest displacement of the payload along the patches of each robot's hands
+            since the first call [m]. Lift (2,): largest height of the payload above a rim of each
+            robot's hands [m], negative where all rims are pressed. Rotation of the payload relative
+            to the carriage that moves all hands, since the first call [rad].
+        """
         data = self._data
         axes = data.xmat[self._bodies].reshape(-1, 3, 3)
         rotation = data.xmat[self._box].reshape(3, 3)

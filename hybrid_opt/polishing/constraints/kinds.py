@@ -195,7 +195,8 @@ class Pressure(ConstraintKind[PressureRow]):
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PressureRow]:
-        """Return rows where the shift exceeds a share of the patch radius."""
+        """Return rows at and beside each local maximum of a robot's pressure shift that exceeds the
+        share `PRESSURE_SHARE` of the patch radius."""
         return self._beyond(carry, PRESSURE_SHARE)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PressureRow]:

@@ -149,7 +149,12 @@ class Job:
         return self.end
 
     def is_touching(self, s: float) -> bool:
-        """Return True if the box is so low during its set-down that it may already stand."""
+        """Return True if the box may already stand at a coordinate s [s].
+
+        This is so if s is in the set-down and the planned position of the box is at most `TOUCH`
+        from its position at the end of the set-down. Once `is_standing` is true, the result is
+        False.
+        """
         if self.phase(s) != "set_down" or self.is_standing:
             return False
         places, (k, x, _) = self.document["box"]["pose"], self._place(s)

@@ -83,7 +83,11 @@ class Press:
         self._speed, self._compliance = config["speed"], config["compliance"]
 
     def tick(self, dt: float, wanted: float, soon: float, felt: float | None) -> None:
-        """Advance the time by dt [s].
+        """Move the pad for one time step, by changing `way`, so that it presses with the commanded
+        force.
+
+        The pad moves to the depth at which the arms' compliance gives the force, corrected by the
+        integral of the measured error. Its speed and depth are bounded.
 
         Args:
             dt: time step [s].
