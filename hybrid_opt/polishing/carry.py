@@ -73,8 +73,14 @@ class PlacedCarry:
 
 
 def local_minima_below(values: Array, limit: float, stride: int | None = None) -> list[int]:
-    """Return the index of the lowest value of every stretch of values (n,) below a limit. With a
-    stride, indices at this stride from it within the stretch are added."""
+    """Return the index of the lowest value in every stretch of values below a limit.
+
+    Args:
+        values: (n,) values along the path.
+        limit: stretches are runs of successive values below this.
+        stride: number of indices; adds all indices of a stretch that are multiples of it away from
+            the lowest value. None adds none.
+    """
     below = values < limit
     if not below.any():
         return []
@@ -92,10 +98,16 @@ def local_minima_below(values: Array, limit: float, stride: int | None = None) -
 
 
 def interpolate_minima(clearance: Array) -> Array:
-    """Return clearances (n, k) lowered to their interpolated minima between places.
+    """Lower clearances to the minima that linear interpolation finds between places.
 
     Where a body passes an edge, the clearance falls linearly to a kink and rises linearly after it.
-    The lines from both sides meet at the minimum, which then counts at both neighbouring places.
+    The lines from both sides meet at the minimum, to which both neighbouring places are lowered.
+
+    Args:
+        clearance: (n, k) clearances [m] of k pairs at n successive places.
+
+    Returns:
+        (n, k) lowered clearances [m].
     """
     low = clearance.copy()
     if len(clearance) < 4:
@@ -112,11 +124,13 @@ def interpolate_minima(clearance: Array) -> Array:
 
 
 class Distances:
-    """Distances between the bodies of one candidate. Each is measured on first use and stored.
+    """Distances between the pairs of bodies of one candidate at n places of its path.
+
+    A distance is measured when it is first needed, and stored.
 
     Attributes:
         bounds: (n, n_pairs) lower bounds of the distances [m].
-        interpolated_clearance: (n, n_pairs) the same bounds, lowered to their minima between places
+        interpolated_clearance: (n, n_pairs) these bounds, lowered to their minima between places
             [m].
     """
 
@@ -140,11 +154,14 @@ class Distances:
         self._unmeasured = np.ones(bounds.shape, dtype=np.bool_)
 
     def closer_than(self, limits: Array) -> dict[int, Array]:
-        """Measure the distances below the limits (n_pairs,) of their pairs [m].
+        """Measure the distances that may be below the limits of their pairs.
+
+        Args:
+            limits: (n_pairs,) limit of each pair [m].
 
         Returns:
-            By pair with any such distance, its distances (n,) [m]: measured below the limit, else
-            `interpolated_clearance`.
+            By index of each pair with such distances, an array (n,) of its distances at all places
+            [m]: measured where the lower bound is below the limit, elsewhere the lower bound.
         """
         close = self.interpolated_clearance < limits
         self._measure_pairs(*(close & self._unmeasured).nonzero())
@@ -163,11 +180,14 @@ class Distances:
         self._unmeasured[places, pairs] = False
 
     def least(self, stretches: Sequence[Stretch], below: float) -> list[float]:
-        """Return the least distance in each stretch [m]. Only distances with bounds below the limit
-        `below` are measured.
+        """Return the least distance in each stretch of places [m].
 
-        Because no distance is below its bound, the lowest value of a stretch is measured repeatedly
-        until the lowest one is a measured one.
+        The lowest value of a stretch is measured repeatedly until the lowest one is a measured one;
+        that is the least distance, because no distance is below its bound.
+
+        Args:
+            stretches: slice of places and index of the pair, for each stretch.
+            below: only distances with lower bounds below this are measured [m].
         """
         open_, found = list(range(len(stretches))), [np.inf] * len(stretches)
         while open_:
@@ -184,9 +204,13 @@ class Distances:
         return found
 
     def exceed(self, limits: Array) -> bool:
-        """Return True if the distances of every pair exceed the pair's limit (n_pairs,) at all
-        places [m]. The pairs with the lowest bounds are measured first, until one violates its
-        limit."""
+        """Return True if the distances of all pairs reach the limits of their pairs at all places.
+
+        Distances with the lowest bounds are measured first, until one is below its limit.
+
+        Args:
+            limits: (n_pairs,) limit of each pair [m].
+        """
         places, pairs = (self.interpolated_clearance < limits).nonzero()
         order = np.argsort(self.interpolated_clearance[places, pairs], kind="stable")
         for first in range(0, len(order), DISTANCE_BATCH):
@@ -213,7 +237,7 @@ class CarryReader:
         )
 
     def read(self, x: Array) -> PlacedCarry:
-        """Evaluate a decision vector (n_var,)."""
+        """Evaluate a decision vector x (n_var,) at all places of the path."""
         cell, evaluator, grid = self._cell, self._cell.evaluator, self._cell.grid
         found = {name: value[0] for name, value in evaluator.outputs(x[None]).items()}
         waypoints = cell.waypoints(x)

@@ -48,10 +48,10 @@ ACTIVE_ROW_LIFETIME = 3
 
 
 class RowSelector:
-    """Selector of the rows of programs for candidates of one evaluator.
+    """Chooses which rows (single scalar inequalities) a program contains near a candidate.
 
-    In drivable cells there are no rows at samples: `hybrid_opt.polishing.drive` limits the forces
-    of the timing.
+    A row is kept if it is near its bound, or if a step violated it. In drivable cells no row
+    belongs to a sample, because `hybrid_opt.polishing.drive` limits the forces of the timing.
     """
 
     def __init__(self, cell: SmoothCell) -> None:
@@ -71,7 +71,12 @@ class RowSelector:
         }
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> set[Row]:
-        """Return the rows of all constraints that are near their bounds at a candidate."""
+        """Return the rows of all kinds of constraints that are near their bounds at a candidate.
+
+        Args:
+            carry: the candidate, evaluated at places of the path.
+            limits: for each robot, True if its normal force is minimised.
+        """
         rows = set[Row]()
         for kind in self._kinds.values():
             for row in kind.near_rows(carry, limits):
@@ -82,13 +87,13 @@ class RowSelector:
     def violated_rows(
         self, carry: PlacedCarry, known: PlacedCarry, program_rows: Collection[Row]
     ) -> set[Row]:
-        """Return the rows of all constraints that a step from a known candidate violates.
+        """Return the rows of all kinds of constraints that are violated after a step.
 
         Args:
             carry: candidate after the step.
             known: candidate before the step.
-            program_rows: rows of the program. Their force rows are never violated, because a force
-                above its peak raises the peak.
+            program_rows: rows of the program that proposed the step. Force rows among these never
+                count as violated, because a force above its peak only raises the peak.
         """
         rows = set[Row]()
         for kind in self._kinds.values():
@@ -101,8 +106,16 @@ class RowSelector:
     def has_violation(
         self, carry: PlacedCarry, known: PlacedCarry, program_rows: Collection[Row]
     ) -> bool:
-        """Return True if a step violates any constraint. Distances are the most expensive, so they
-        are checked last and only until one is too small."""
+        """Return True if a candidate violates any constraint after a step.
+
+        Distances are the most expensive, so they are checked last and only until one is too small.
+
+        Args:
+            carry: candidate after the step.
+            known: candidate before the step.
+            program_rows: rows of the program that proposed the step. Force rows among these never
+                count as violated.
+        """
         return any(
             row not in program_rows or not isinstance(row, ForceRow)
             for kind in self._kinds.values()
@@ -114,8 +127,13 @@ class RowSelector:
     def required_values(
         self, carry: PlacedCarry, rows: Iterable[Row], is_relaxed: bool = False
     ) -> dict[Row, float]:
-        """Return the value that each row has to exceed. The kind of the row computes it from a
-        candidate, for example from the distances there."""
+        """Return for each row the value that it has to exceed in the next program.
+
+        Args:
+            carry: the candidate about which the program is formed.
+            rows: rows of the program.
+            is_relaxed: True to require no more of a distance than the candidate satisfies.
+        """
         values: dict[Row, float] = {}
         for kind, own in self._by_kind(rows).items():
             values.update(zip(own, kind.required_values(carry, own, is_relaxed), strict=True))
@@ -128,8 +146,14 @@ class RowSelector:
         rows: Iterable[Row],
         before: Mapping[Row, float],
     ) -> dict[Row, float]:
-        """Return the values that violated rows have to exceed from now on, computed by the kinds of
-        the rows."""
+        """Return for each row that a step violated the value that it has to exceed from now on.
+
+        Args:
+            carry: candidate after the step.
+            known: candidate before the step.
+            rows: the violated rows.
+            before: values that the rows of the last program had to exceed; 0 for a row not in it.
+        """
         values: dict[Row, float] = {}
         for kind, own in self._by_kind(rows).items():
             margins = [before.get(row, 0.0) for row in own]
@@ -137,7 +161,10 @@ class RowSelector:
         return values
 
     def persists(self, row: Row) -> bool:
-        """Return True if a row's tightened bound stays valid at other candidates."""
+        """Return True if a tightened bound of this row stays valid at other candidates.
+
+        If not, the bound is relative to the candidate at which it was measured.
+        """
         return self._kind_of(row).persists
 
     def _kind_of(self, row: Row) -> ConstraintKind[Any]:
@@ -154,14 +181,18 @@ class RowSelector:
 
 
 class WorkingSet:
-    """Rows that the steps of one solve have added, with the value that each has to exceed."""
+    """Rows that a solve keeps in its programs, besides the rows that are near their bounds.
+
+    These are rows that a rejected step violated, each with the value that it has to exceed, and
+    rows that were active in one of the last programs.
+    """
 
     def __init__(self, active: RowSelector, half: Array) -> None:
         """Start with no rows.
 
         Args:
-            active: selector of rows.
-            half: (n,) half ranges of the variables that steps move.
+            active: selector of rows, which knows whose tightened bounds persist.
+            half: (n,) half ranges of the variables that steps change [m, rad].
         """
         self._active, self._half = active, half
         self._tightened: dict[Row, tuple[float, Array]] = {}
@@ -169,16 +200,20 @@ class WorkingSet:
 
     @property
     def rows(self) -> set[Row]:
-        """Return the rows that the next program has beside those near their bounds."""
+        """All rows that the next program has besides those near their bounds."""
         return {*self._tightened, *self._active_for}
 
     def tighten(self, required: dict[Row, float], x: Array, radius: float) -> None:
-        """Raise the required values of the next program's rows, in place.
+        """Raise the required values of rows in place to the share of their tightening that counts.
+
+        The share is the trust region's radius over the distance to the candidate at which the row
+        was tightened, at most one.
 
         Args:
-            required: all rows of the program, and their required values.
-            x: variables of the candidate that the program is about, (n,) or more.
-            radius: radius of the trust region.
+            required: value that each row of the next program has to exceed.
+            x: decision vector about which the next program is formed; its first n entries are the
+                variables that steps change.
+            radius: radius of the trust region [half ranges of the variables].
         """
         for row, (value, tightened_at) in self._tightened.items():
             n = len(self._half)
@@ -189,13 +224,15 @@ class WorkingSet:
     def learn_from_rejection(
         self, bounds: Mapping[Row, float], x: Array, required: Mapping[Row, float]
     ) -> bool:
-        """Add the rows that a rejected step to x violates; return True if any row is new or gets a
-        tighter bound.
+        """Add the rows that a rejected step violates.
 
         Args:
-            bounds: the violated rows, and their tightened bounds.
-            x: decision vector after the step.
-            required: rows of the program and their required values.
+            bounds: tightened bound of each violated row.
+            x: (n_var,) decision vector after the step.
+            required: value that each row of the program had to exceed.
+
+        Returns:
+            True if any row is new, or if its bound rises by more than `LEAST_TIGHTENING`.
         """
         is_new = False
         for row, value in bounds.items():
@@ -206,17 +243,25 @@ class WorkingSet:
         return is_new
 
     def add(self, rows: Iterable[Row], x: Array) -> None:
-        """Add rows that the program of a step to x lacked, with their usual bounds."""
+        """Add rows that a program lacked, without tightening their bounds.
+
+        Args:
+            rows: the missing rows.
+            x: (n_var,) decision vector to which the step of this program led.
+        """
         self._tightened.update(dict.fromkeys(rows, (-np.inf, x)))
 
     def mark_active(self, rows: Iterable[Row]) -> None:
-        """Keep these active rows for the next `ACTIVE_ROW_LIFETIME` programs."""
+        """Keep rows with a nonzero multiplier for the next `ACTIVE_ROW_LIFETIME` programs."""
         left = {row: count - 1 for row, count in self._active_for.items() if count > 1}
         self._active_for = left | dict.fromkeys(rows, ACTIVE_ROW_LIFETIME)
 
     def on_new_best(self, keep_active_set: bool = False) -> None:
-        """Discard bounds that are relative to the former best candidate. Unless `keep_active_set`
-        is True, discard the active rows too."""
+        """Discard the tightened bounds that are relative to the former best candidate.
+
+        Args:
+            keep_active_set: False to discard also the rows that were active in the last programs.
+        """
         if not keep_active_set:
             self._active_for = {}
         self._tightened = {

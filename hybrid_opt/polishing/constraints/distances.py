@@ -58,13 +58,15 @@ KINK_WINDOW = 0.04
 
 
 class DistanceConstraintKind(ConstraintKind[PathRow]):
-    """Kind of constraint on the distance of a pair.
+    """Kind of constraint on the distance of a pair of bodies.
 
     Attributes:
-        window: number of places on both sides of a row over which the distance is measured.
-        wanted, least: (n_pairs,) required distance of each pair, and the distance below which the
-            constraint is violated [m].
-        separable: pairs with known gaps.
+        window: number of places on both sides of a row's place over which the least distance is
+            measured.
+        wanted: (n_pairs,) distance that programs require of each pair [m].
+        least: (n_pairs,) distance below which a pair violates the constraint [m].
+        separable: indices of the pairs of two boxes, for which gaps along single directions are
+            computed.
     """
 
     window: int = 0
@@ -81,8 +83,17 @@ class DistanceConstraintKind(ConstraintKind[PathRow]):
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[PathRow], is_relaxed: bool = False
     ) -> list[float]:
-        """Return the wanted distances minus the error of the smooth bound; a small margin at places
-        out of reach."""
+        """Return for each row the wanted distance minus the error of the smooth bound [m].
+
+        The error is the measured least distance in the row's window minus the bound's value. A row
+        at a place that an arm does not reach gets the small value `PATCH_MARGIN`.
+
+        Args:
+            carry: the candidate, evaluated at places of the path.
+            rows: the rows.
+            is_relaxed: True to require no more than the candidate's distance where that is
+                positive.
+        """
         values = np.full(len(rows), PATCH_MARGIN)
         chosen = [k for k, row in enumerate(rows) if row.place < carry.reached]
         if not chosen:
@@ -101,26 +112,26 @@ class DistanceConstraintKind(ConstraintKind[PathRow]):
 
 
 def pair_of(row: PathRow) -> int:
-    """Return the index of the active pair that a distance row belongs to."""
+    """Return the index of the pair of bodies whose distance a row limits."""
     assert isinstance(row.constraint, Clearance | SeparatingAxisGap | AxisSwitchGap)
     return row.constraint.pair
 
 
 class Clearances(DistanceConstraintKind):
-    """Rows at the minima of every pair that comes near."""
+    """Rows on the distances of pairs that include a body of an arm, where the distance is least."""
 
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows of the pairs whose lower bound is small."""
+        """Return rows at the local minima of distances with lower bounds below `BODY_DISTANCE`."""
         for pair in np.flatnonzero(carry.distances.bounds.min(axis=0) < BODY_DISTANCE).tolist():
             if pair not in self.separable:
                 for place in local_minima_below(carry.distances.bounds[:, pair], BODY_DISTANCE):
                     yield PathRow(Clearance(pair, self._columns[pair]), place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return rows of the pairs that are too close, at the minimum and around it. An
-        interpolated minimum has rows at both neighbouring places."""
+        """Return rows for pairs that are too close: at the place of the least distance, at the next
+        place, and at some distance before and after."""
         width = self.grid.places(BESIDE_CLEARANCE)
         for pair, distance in carry.distances.closer_than(self.least).items():
             if pair in self.separable:
@@ -132,11 +143,16 @@ class Clearances(DistanceConstraintKind):
 
 
 class SeparatingAxisGaps(DistanceConstraintKind):
-    """Rows of single gaps between the payload and a box, away from kinks."""
+    """Rows on the gap between payload and an obstacle box along one direction.
+
+    They lie away from kinks, the places at which the direction of the largest gap changes.
+    """
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows at a few places of every stretch of the path along which the payload is near
-        a box."""
+        """Return rows at regular distances along every stretch on which the payload is near a box.
+
+        None of them lies closer than `BESIDE_KINK` to a kink.
+        """
         grid = self.grid
         beside = grid.places(BESIDE_KINK)
         stretches = (
@@ -155,9 +171,12 @@ class SeparatingAxisGaps(DistanceConstraintKind):
                 yield separation(pair, gaps, place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return rows at the places where the payload is too close to a box, except near kinks
-        of the known candidate. Each row has the direction of the largest gap of the known
-        candidate."""
+        """Return rows where the payload is too close to a box after a step, and at some distance
+        before and after.
+
+        Each has the direction of the largest gap before the step. Places near a kink of the
+        candidate before the step are left to `AxisSwitchGaps`.
+        """
         half = self.grid.places(KINK_WINDOW) // 2
         for pair, gaps, place, near in violated_passages(self, carry, known):
             if not near:
@@ -167,21 +186,24 @@ class SeparatingAxisGaps(DistanceConstraintKind):
 
 
 class AxisSwitchGaps(DistanceConstraintKind):
-    """Rows of the kinks at which the payload passes an edge."""
+    """Rows on the height of a kink, at which the payload passes an edge of a box."""
 
     def __init__(self, cell: SmoothCell) -> None:
         super().__init__(cell)
         self.window = cell.grid.places(KINK_WINDOW)
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows for the kinks of the clearance that are lower than `KINK_DISTANCE`."""
+        """Return a row for each kink of the clearance that is lower than `KINK_DISTANCE`."""
         for pair, gaps in near_gaps(self, carry):
             for kink, place in edges(gaps, KINK_DISTANCE):
                 yield passing(pair, gaps, kink, place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return rows for kinks of the known candidate that lie near places where the new candidate
-        is too close to a box."""
+        """Return a row for each kink near a place where the payload is too close to a box after a
+        step.
+
+        The kinks are those of the candidate before the step.
+        """
         for pair, gaps, _, near in violated_passages(self, carry, known):
             for kink, place in near:
                 yield passing(pair, gaps, kink, place)
@@ -192,9 +214,9 @@ class Gaps:
     """Gaps of a separable pair along n directions at m places.
 
     Attributes:
-        along: (m, n) gap along each direction [m].
+        along: (m, n) gap between both boxes along each direction [m].
         best: (m,) index of the direction with the largest gap.
-        height: (m,) largest gap [m].
+        height: (m,) largest gap [m], a lower bound of the distance.
     """
 
     along: Array
@@ -203,14 +225,22 @@ class Gaps:
 
     @classmethod
     def from_values(cls, along: Array) -> Gaps:
-        """Find the largest of the gaps along all directions (m, n) [m] at each place."""
+        """Build the record from the gaps (m, n) [m] at m places along n directions."""
         best = along.argmax(axis=1)
         return cls(along, best, along[np.arange(len(best)), best])
 
 
 def edges(gaps: Gaps, limit: float) -> list[tuple[int, int]]:
-    """Return the kinks of the clearance below a limit [m]: for each the index of the place before
-    the kink, and the index of the lower one of both neighbouring places."""
+    """Find the kinks at which the largest gap changes from a falling to a rising one.
+
+    Args:
+        gaps: gaps of one pair along the path.
+        limit: largest gap [m] above which kinks are left out.
+
+    Returns:
+        For each kink the index of the place before it, and the index of that one of its two
+        neighbouring places at which the largest gap is smaller.
+    """
     best, height, along = gaps.best, gaps.height, gaps.along
     return [
         (k, k + int(height[k + 1] < height[k]))
@@ -222,18 +252,37 @@ def edges(gaps: Gaps, limit: float) -> list[tuple[int, int]]:
 
 
 def passing(pair: int, gaps: Gaps, kink: int, place: int) -> PathRow:
-    """Return the row for a kink found by `edges`."""
+    """Return the row for a kink of a pair.
+
+    Args:
+        pair: index of the pair.
+        gaps: gaps of the pair along the path.
+        kink: index of the place before the kink.
+        place: index of the place of the row.
+    """
     before, after = (int(gaps.best[k]) for k in (kink, kink + 1))
     return PathRow(AxisSwitchGap(pair, before, after), place)
 
 
 def separation(pair: int, gaps: Gaps, place: int) -> PathRow:
-    """Return the row for the largest gap at a place."""
+    """Return the row for the largest gap of a pair at a place.
+
+    Args:
+        pair: index of the pair.
+        gaps: gaps of the pair along the path.
+        place: index of the place of the row.
+    """
     return PathRow(SeparatingAxisGap(pair, int(gaps.best[place])), place)
 
 
 def near_gaps(kind: DistanceConstraintKind, carry: PlacedCarry) -> Iterable[tuple[int, Gaps]]:
-    """Yield every separable pair that comes nearer than `FAR_GAP_DISTANCE`, with its gaps."""
+    """Yield the index and the gaps of every separable pair that comes nearer than
+    `FAR_GAP_DISTANCE`.
+
+    Args:
+        kind: kind of constraint, which knows the separable pairs.
+        carry: the candidate, evaluated at places of the path.
+    """
     for pair in np.flatnonzero(carry.distances.bounds.min(axis=0) < FAR_GAP_DISTANCE).tolist():
         if pair in kind.separable:
             yield pair, Gaps.from_values(carry.gaps(pair))
@@ -242,8 +291,17 @@ def near_gaps(kind: DistanceConstraintKind, carry: PlacedCarry) -> Iterable[tupl
 def violated_passages(
     kind: DistanceConstraintKind, carry: PlacedCarry, known: PlacedCarry
 ) -> Iterable[tuple[int, Gaps, int, list[tuple[int, int]]]]:
-    """Yield each place at which a separable pair is too close, as the index of the pair, the gaps
-    of the known candidate, the place, and the kinks of the known candidate near the place."""
+    """Yield the places at which a separable pair is too close after a step.
+
+    Args:
+        kind: kind of constraint, which knows the separable pairs and their least distances.
+        carry: candidate after the step.
+        known: candidate before the step.
+
+    Yields:
+        Index of the pair; its gaps before the step; index of the place; and the kinks before the
+        step that lie near the place, as `edges` returns them.
+    """
     window = kind.grid.places(KINK_WINDOW)
     for pair, distance in carry.distances.closer_than(kind.least).items():
         if pair not in kind.separable:

@@ -69,12 +69,13 @@ AnyRow = TypeVar("AnyRow", ForceRow, PressureRow, PathRow)
 
 
 class ConstraintKind(ABC, Generic[AnyRow]):
-    """One kind of constraint.
+    """One kind of constraint: which rows it has near a candidate, and what they have to exceed.
 
     Attributes:
-        cell, grid: the smooth model and the places along its path.
-        persists: whether tightened bounds stay valid at other candidates. If not, they are relative
-            to the candidate at which they were measured.
+        cell: shared data of the polish of a workcell.
+        grid: places along the path.
+        persists: True if tightened bounds stay valid at other candidates. If False, they are
+            relative to the candidate at which they were measured.
     """
 
     persists: bool = False
@@ -84,43 +85,54 @@ class ConstraintKind(ABC, Generic[AnyRow]):
 
     @abstractmethod
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[AnyRow]:
-        """Return the rows that are near their bounds at a candidate."""
+        """Return the rows of this kind that are near their bounds at a candidate.
+
+        Args:
+            carry: the candidate, evaluated at places of the path.
+            limits: for each robot, True if its normal force is minimised.
+        """
 
     @abstractmethod
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[AnyRow]:
-        """Return the rows that a step from a known candidate violates."""
+        """Return the rows of this kind that are violated after a step.
+
+        Args:
+            carry: candidate after the step.
+            known: candidate before the step.
+        """
 
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[AnyRow], is_relaxed: bool = False
     ) -> list[float]:
-        """Return the value that each row has to exceed, computed at a candidate.
+        """Return for each row the value that it has to exceed in a program about a candidate.
 
         Args:
-            carry: the candidate at places of the path.
+            carry: the candidate, evaluated at places of the path.
             rows: the rows.
-            is_relaxed: True to require no more than a feasible candidate satisfies.
+            is_relaxed: True to require no more of a distance than the candidate satisfies.
         """
         return [PATCH_MARGIN] * len(rows)
 
     def tightened_bounds(
         self, carry: PlacedCarry, known: PlacedCarry, rows: Sequence[AnyRow], before: list[float]
     ) -> list[float]:
-        """Return the values that violated rows have to exceed from now on.
+        """Return for each row that a step violated the value that it has to exceed from now on.
 
         Args:
             carry: candidate after the step.
             known: candidate before the step.
             rows: the violated rows.
-            before: required values of the rows so far; the margin for new rows.
+            before: values that the rows of the last program had to exceed; 0 for a row not in it.
         """
         return self.required_values(carry, rows)
 
 
 class Forces(ConstraintKind[ForceRow]):
-    """Rows of normal forces: of the branch with tight friction cones along the whole path, and of
-    other branches where they nearly govern.
+    """Rows that keep normal forces below the peak forces, which are variables of the program.
 
-    Required values have no meaning here: a force has to stay below its peak, which is a variable.
+    A normal force is the largest of several linear functions (branches) of the required force. The
+    branch with tight friction cones has rows along the whole path, other branches only where they
+    nearly are the largest. `required_values` has no meaning for force rows.
     """
 
     persists = True
@@ -137,8 +149,11 @@ class Forces(ConstraintKind[ForceRow]):
         self._main = PROGRAM_BRANCH if by_program else CONE_TIGHT
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[ForceRow]:
-        """Return force rows at a stride along the path, at the peaks of the force and beside
-        them."""
+        """Return force rows at regular distances along the path, and at and beside the local maxima
+        of the normal forces.
+
+        A robot whose force only breaks ties has rows at fewer samples.
+        """
         samples = self._every | self._ends | self._peaks(carry)
         for robot, limited in enumerate(limits):
             for sample in samples if limited else samples & self._ties:
@@ -146,11 +161,15 @@ class Forces(ConstraintKind[ForceRow]):
         yield from self._other_branches(carry)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[ForceRow]:
-        """Return rows for the other branches at samples where they govern the force."""
+        """Return rows for branches other than that with tight friction cones, at samples where one
+        of them is, or nearly is, the largest."""
         return self._other_branches(carry)
 
     def peak_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> set[ForceRow]:
-        """Return rows at the peaks of a candidate's forces, which the program underestimated."""
+        """Return rows at and beside the local maxima of a candidate's minimised normal forces.
+
+        A program without these rows underestimates the peak forces.
+        """
         return {
             ForceRow(robot, self._main, sample)
             for robot, limited in enumerate(limits)
@@ -159,7 +178,7 @@ class Forces(ConstraintKind[ForceRow]):
         }
 
     def _values(self, carry: PlacedCarry) -> Array:
-        """Compute all branches (samples, 2, branches) of both robots' normal forces [N]."""
+        """Compute every branch (samples, 2, branches) of both robots' normal forces [N]."""
         return np.asarray(np.einsum("rbk,nk->nrb", self.cell.coefficients, carry.split))
 
     def _peaks(self, carry: PlacedCarry) -> set[int]:
@@ -173,9 +192,11 @@ class Forces(ConstraintKind[ForceRow]):
         return {int(k) for k in (tops[:, None] + np.array([-1, 0, 1])).ravel()}
 
     def _other_branches(self, carry: PlacedCarry) -> list[ForceRow]:
-        """Return rows where a branch other than the one with tight cones governs, or nearly does.
+        """Return rows for branches other than that with tight friction cones, where one of them is,
+        or nearly is, the largest.
 
-        Robust forces have only one row per sample, for the governing case.
+        The list is empty for robust forces, and for forces that a convex program computes: they
+        have one row per robot and sample.
         """
         if self.cell.robust is not None or self._main == PROGRAM_BRANCH:
             return []
@@ -189,8 +210,11 @@ class Forces(ConstraintKind[ForceRow]):
 
 
 class Pressure(ConstraintKind[PressureRow]):
-    """Rows of the shift of pressure: at its maximum in every stretch near the rim of a patch, and
-    beside it."""
+    """Rows that keep the centres of pressure within the patches.
+
+    They lie where the shift of the centre of pressure is largest in a stretch of the path near the
+    rim, and beside it.
+    """
 
     persists = True
 
@@ -200,8 +224,10 @@ class Pressure(ConstraintKind[PressureRow]):
         return self._beyond(carry, PRESSURE_SHARE)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PressureRow]:
-        """Return rows where the shift reaches the rim. Half of the margin is left to the solver's
-        rounding."""
+        """Return rows at and beside each local maximum of a pressure shift that reaches the rim.
+
+        Half of `PATCH_MARGIN` is left for rounding of the solver.
+        """
         return self._beyond(carry, (1.0 - PATCH_MARGIN / 2.0) ** 0.5)
 
     def _beyond(self, carry: PlacedCarry, share: float) -> Iterable[PressureRow]:
@@ -214,23 +240,26 @@ class Pressure(ConstraintKind[PressureRow]):
 
 
 class JointLimits(ConstraintKind[PathRow]):
-    """Rows of joint limits, at the local minima of every joint's distance to its limits."""
+    """Rows that keep joints within their limits, at the local minima of the distance to a limit."""
 
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows of joints near a limit."""
+        """Return rows where a joint is closer to a limit than `JOINT_DISTANCE`."""
         return self._below(carry, JOINT_DISTANCE)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return rows of joints that are beyond a limit or have used more than half of the
-        margin."""
+        """Return rows where a joint is beyond a limit, or closer to it than half of
+        `SAMPLING_MARGIN`."""
         return self._below(carry, SAMPLING_MARGIN / 2.0)
 
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[PathRow], is_relaxed: bool = False
     ) -> list[float]:
-        """Return the margin to the limits, which covers the path between places."""
+        """Return `SAMPLING_MARGIN` [rad] for every row.
+
+        This distance to the limit covers the path between places.
+        """
         return [SAMPLING_MARGIN] * len(rows)
 
     def _below(self, carry: PlacedCarry, limit: float) -> Iterable[PathRow]:
@@ -247,14 +276,21 @@ class JointLimits(ConstraintKind[PathRow]):
 
 
 class ManipulabilityLimits(ConstraintKind[PathRow]):
-    """Rows where |det J| is low, because nothing is defined beyond the reach of an arm."""
+    """Rows that keep both arms away from singularities, by a least value of ``|det J|``.
+
+    J is an arm's Jacobian. These rows also bound the reach: at its edge ``|det J|`` is zero, and
+    beyond it nothing is defined.
+    """
 
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows every few places where |det J| is below a share of its median along the path,
-        and closer rows near its least allowed value, so that the minimum does not move between two
-        rows."""
+        """Return rows at regular distances along the stretches of the path with a low ``|det J|``.
+
+        Low is below `MANIPULABILITY_SHARE` of the median along the path. Where ``|det J|`` is near
+        its least allowed value, rows are closer together, so that the minimum does not move between
+        two of them.
+        """
         places = self.grid.places
         for arm in (0, 1):
             measure = carry.manipulability[:, arm]
@@ -265,9 +301,11 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
                 yield PathRow(ManipulabilityLimit(arm), place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return rows where |det J| is below its least allowed value plus half of the margin. If an
-        arm loses the path, return also rows at this place and after it, where the arm is stretched
-        out and so singular."""
+        """Return rows where ``|det J|`` is below its least allowed value plus half of the margin.
+
+        If an arm does not reach all places, its rows at the first unreachable place and at two
+        later ones are returned too: there the arm is stretched out and so singular.
+        """
         least = (1.0 + SAMPLING_MARGIN / 2.0) ** 0.5
         for arm in (0, 1):
             for place in local_minima_below(carry.manipulability[:, arm], least):
@@ -280,14 +318,22 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[PathRow], is_relaxed: bool = False
     ) -> list[float]:
-        """Return the margin to the least value, which covers the path between places."""
+        """Return `SAMPLING_MARGIN` for every row.
+
+        The margin applies to the square of ``|det J|`` over its least allowed value, and covers the
+        path between places.
+        """
         return [SAMPLING_MARGIN] * len(rows)
 
     def tightened_bounds(
         self, carry: PlacedCarry, known: PlacedCarry, rows: Sequence[PathRow], before: list[float]
     ) -> list[float]:
-        """Return, if an arm lost the path, the mean of the old bound and the known candidate's
-        value."""
+        """Return for each row that a step violated the value that it has to exceed from now on.
+
+        If an arm does not reach all places after the step, this is the mean of the row's last
+        required value and its value at the candidate before the step. Otherwise it is
+        `SAMPLING_MARGIN`.
+        """
         if not carry.unreachable_arms:
             return self.required_values(carry, rows)
         has = smooth_values(self.cell, known, rows)
@@ -295,7 +341,16 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
 
 
 def smooth_values(cell: SmoothCell, carry: PlacedCarry, rows: Sequence[PathRow]) -> Array:
-    """Evaluate rows in the smooth model."""
+    """Compute the values of rows by the smooth model at a candidate.
+
+    Args:
+        cell: shared data of the polish.
+        carry: the candidate, evaluated at places of the path.
+        rows: n rows at places that both arms reach.
+
+    Returns:
+        (n,) values in the units of their constraints [m, rad or none].
+    """
     values = np.empty(len(rows))
     functions, groups = cell.functions, dict[NumericFunction, list[int]]()
     for k, row in enumerate(rows):
