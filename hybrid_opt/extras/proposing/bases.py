@@ -84,13 +84,16 @@ POSES = 33
 
 
 def base_choices(problem: Problem, spins: Array, rng: np.random.Generator) -> list[dict[str, Any]]:
-    """Return additions to a problem's tables that give both robots a base, best first. Arms of one
-    machine get the same base.
+    """Propose bases for both robots, the most promising pair first. Both arms of one machine get
+    the same base.
 
     Args:
         problem: the problem.
-        spins: spins of both pads that are tried [rad].
+        spins: (n,) rotations of the pads about their normals that are tried [rad].
         rng: generator of random postures.
+
+    Returns:
+        Additions to the problem's tables, one dictionary per pair of bases.
     """
     found: list[tuple[float, dict[str, Any]]] = []
     for side in problem.sides():
@@ -102,7 +105,16 @@ def base_choices(problem: Problem, spins: Array, rng: np.random.Generator) -> li
 def _scored(
     problem: Problem, spins: Array, rng: np.random.Generator
 ) -> list[tuple[float, dict[str, Any]]]:
-    """Return such additions with their scores for the contacts of a problem."""
+    """Propose bases for both robots with the contacts of one problem.
+
+    Args:
+        problem: the problem, with contacts.
+        spins: (n,) rotations of the pads about their normals that are tried [rad].
+        rng: generator of random postures.
+
+    Returns:
+        Pairs of a score, larger is better, and the additions to the problem's tables.
+    """
     draft = draft_of(problem)
     scorer = PlaceScorer(problem, draft, spins, rng)
     if problem.is_machine:
@@ -130,7 +142,8 @@ def _scored(
 
 
 def draft_of(problem: Problem) -> Workcell:
-    """Build the cell of a problem with provisional bases and chosen redundant joints."""
+    """Build the cell of a problem, with provisional bases and an automatic choice of the redundant
+    joints."""
     sides = [_sideways(problem, arm) for arm in (0, 1)]
     near = [_base(problem, k, at + 0.4 * out, out) for k, (at, out) in enumerate(sides)]
     if problem.is_machine:
@@ -148,8 +161,17 @@ def _standing(problem: Problem, bases: list[Array]) -> dict[str, Any]:
 
 
 def _sideways(problem: Problem, arm: int) -> tuple[Array, Array]:
-    """Compute the middle (3,) of the path of a robot's contact [m], and the outward direction
-    (3,)."""
+    """Compute the middle between a contact's places at start and goal, and the direction away from
+    the box.
+
+    Args:
+        problem: the problem.
+        arm: index of the contact's robot.
+
+    Returns:
+        The middle (3,) in the world [m], and the horizontal unit vector (3,) from the middle of the
+        box's path to it.
+    """
     point = np.append(np.array(problem.contacts[arm]["xyz"], dtype=float), 1.0)
     ends = [(box_placement(problem.orientation, pose) @ point)[:3] for pose in problem.poses]
     middle = (ends[0] + ends[1]) / 2.0
@@ -160,7 +182,15 @@ def _sideways(problem: Problem, arm: int) -> tuple[Array, Array]:
 
 
 def _base(problem: Problem, arm: int, point: Array, outwards: Array) -> Array:
-    """Compute the base (6,) on the ground below a point, facing the carry."""
+    """Compute the base pose (6,) [m, rad] of a robot below a point, facing against `outwards`. The
+    height is the one in the file, else 0.
+
+    Args:
+        problem: the problem.
+        arm: index of the robot.
+        point: (3,) position in the world, of which x and y are used [m].
+        outwards: (3,) horizontal direction from the carry to the robot.
+    """
     given = problem.data["robots"][arm].get("base", {}).get("xyz", [0.0, 0.0, 0.0])
     yaw = float(np.arctan2(-outwards[1], -outwards[0]))
     return np.array([point[0], point[1], float(given[2]), 0.0, 0.0, yaw])
@@ -177,8 +207,13 @@ def _places(problem: Problem, draft: Workcell, arm: int) -> list[Array]:
 
 
 def machine_places(problem: Problem, draft: Workcell) -> list[Array]:
-    """Compute bases (6,) of a machine with both arms. The line through the shoulders is parallel to
-    the line through both contacts, and the carry is within reach of the arms."""
+    """Propose base poses (6,) [m, rad] of a machine with two arms. The line through its shoulders
+    is parallel to the line through both contacts, and the arms can reach the carry.
+
+    Args:
+        problem: the problem, with contacts.
+        draft: cell of the problem with a provisional base.
+    """
     own = inverse(draft.robots[0].T_world_base)
     at = [(own @ np.append(point, 1.0))[:3] for point in shoulder_positions(draft.robots)]
     middle, outwards = _sideways(problem, 0)
@@ -200,8 +235,16 @@ def machine_places(problem: Problem, draft: Workcell) -> list[Array]:
 
 
 def _mean_reach(draft: Workcell, at: list[Array]) -> Array:
-    """Compute the mean vector (3,) [m] from a machine's shoulders to the last joints of its arms,
-    over random postures of both, in the base frame."""
+    """Compute the mean vector from a machine's shoulders to the last joints of its arms, over
+    random postures of both arms.
+
+    Args:
+        draft: the cell.
+        at: position (3,) of each shoulder in the base frame [m].
+
+    Returns:
+        (3,) in the base frame [m].
+    """
     rng, reaches = np.random.default_rng(0), []
     for arm in (0, 1):
         kinematics = ArmKinematics(draft, arm)
@@ -216,9 +259,10 @@ class RankedBase:
     """A base from which an arm follows the box.
 
     Attributes:
-        base: (6,) pose of the base [m, rad].
+        base: (6,) pose of the base in the world [m, rad].
         value: score; larger is better.
-        follows: (k,) True for detours along which the arm follows the box.
+        follows: (k,) True for each of the scorer's k box paths along which the arm can hold the
+            box.
     """
 
     base: Array
@@ -227,17 +271,17 @@ class RankedBase:
 
 
 class PlaceScorer:
-    """Evaluator of bases of robots for given contacts."""
+    """Evaluator of base poses of robots, for given contacts."""
 
     def __init__(
         self, problem: Problem, draft: Workcell, spins: Array, rng: np.random.Generator
     ) -> None:
-        """Prepare both arms.
+        """Prepare both arms, and the paths of the box that they should be able to follow.
 
         Args:
             problem: the problem, with contacts.
             draft: cell of the problem with provisional bases and chosen redundant joints.
-            spins: spins of both pads that are tried [rad].
+            spins: (n,) rotations of the pads about their normals that are tried [rad].
             rng: generator of random postures.
         """
         self._problem, self._draft, self._rng = problem, draft, rng
@@ -255,8 +299,13 @@ class PlaceScorer:
         self._feet = [_feet(draft, arm) for arm in (0, 1)]
 
     def place(self, arm: int, base: Array) -> RankedBase | None:
-        """Evaluate a base (6,) of an arm. None if the robot collides at this base or its arm does
-        not follow the box."""
+        """Evaluate a base of an arm. None if the robot collides there, or if the arm cannot hold
+        the box from start to goal.
+
+        Args:
+            arm: index of the arm.
+            base: (6,) pose of the base in the world [m, rad].
+        """
         if not self._stands_free(arm, base):
             return None
         T = pose_matrix(base[:3], base[3:])
@@ -269,15 +318,23 @@ class PlaceScorer:
         return RankedBase(base, value, self._followed(kinematics, holds))
 
     def _stands_free(self, arm: int, base: Array) -> bool:
-        """Return True if the robot at this base (6,) meets no body of the environment except its
-        floor."""
+        """Return True if the robot's foot and fixed bodies, with its base at the pose (6,) [m,
+        rad], touch no body of the environment. A floor below the base does not count."""
         T = pose_matrix(base[:3] + np.array([0.0, 0.0, ABOVE]), base[3:])
         feet = tuple(piece.moved(T) for piece in self._feet[arm])
         return all(coal_distance(feet, pieces) > 0.0 for pieces in self._environment)
 
     def _followed(self, kinematics: ArmKinematics, holds: Sequence[Hold]) -> NDArray[np.bool_]:
-        """Return (k,) True for detours along which the arm follows the box with one of these holds,
-        redundant joints fixed."""
+        """Find the box paths, of the scorer's k, along which an arm can hold the box with fixed
+        redundant joints.
+
+        Args:
+            kinematics: the arm.
+            holds: holds of the arm, of which one has to work for a path.
+
+        Returns:
+            (k,) True for paths that the arm can follow.
+        """
         robot = self._draft.robots[kinematics.arm]
         k, m, _ = self._detours.shape
         if not k:
@@ -292,8 +349,16 @@ class PlaceScorer:
         return np.asarray((fine & (kept == m)).reshape(len(holds), k).any(axis=0))
 
     def _hidden(self, arm: int, shoulder: Array) -> float:
-        """Compute the share of start and goal at which the environment is between a shoulder (3,)
-        and the robot's contact, in the horizontal plane."""
+        """Compute for how many of the two ends of the carry a body of the environment stands
+        between a shoulder and the robot's contact, seen from above.
+
+        Args:
+            arm: index of the arm.
+            shoulder: (3,) position of the shoulder in the world [m].
+
+        Returns:
+            0, 0.5 or 1.
+        """
         point = np.append(np.array(self._problem.contacts[arm]["xyz"], dtype=float), 1.0)
         hit = 0
         for pose in self._problem.poses:
@@ -313,8 +378,8 @@ class PlaceScorer:
 
 
 def _feet(draft: Workcell, arm: int) -> tuple[Piece, ...]:
-    """Return the pieces that stand with a robot's base, in the base frame: a foot, and the fixed
-    bodies of the robot or of its machine. Fixed bodies of a machine belong to the first arm."""
+    """Return the solids that stand still with a robot's base, in the base frame: a cylinder as
+    foot, and the robot's fixed bodies. Fixed bodies of a machine belong to its first arm."""
     robot = draft.robots[arm]
     own = inverse(robot.T_world_base)
     standing = [
@@ -327,18 +392,29 @@ def _feet(draft: Workcell, arm: int) -> tuple[Piece, ...]:
 
 
 def shared_room(first: RankedBase, second: RankedBase) -> float:
-    """Score the share of detours along which both arms follow the box."""
+    """Score two bases by the share of box paths along which both arms can hold the box.
+
+    Args:
+        first: a base of the first robot.
+        second: a base of the second robot.
+
+    Returns:
+        `ROOMY` times this share.
+    """
     both = first.follows & second.follows
     return ROOMY * float(both.mean()) if len(both) else 0.0
 
 
 def free_detours(workcell: Workcell, start: Array, goal: Array) -> Array:
-    """Return the detours of the box (k, POSES, 6) that are free of collisions: lift, move aside,
-    move along, move back, lower. k may be 0.
+    """Compute paths of the box that are free of collisions: it is lifted, moved aside, along and
+    back, and lowered.
 
     Args:
         workcell: the cell.
         start, goal: (6,) box poses [m, rad].
+
+    Returns:
+        (k, POSES, 6) box poses of k paths [m, rad]; k may be 0.
     """
     angles = np.arange(8) * np.pi / 4.0
     ways = np.column_stack([np.cos(angles), np.sin(angles), np.zeros(8)])

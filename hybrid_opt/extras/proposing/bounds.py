@@ -45,11 +45,12 @@ CENTRING_MOVES = 3
 
 @dataclass(frozen=True)
 class Bounds:
-    """Bounds of a decision vector, with a feasible carry.
+    """Bounds of a decision vector, with a feasible carry between them.
 
     Attributes:
-        carry: (n_var,) feasible carry within the bounds, as near as possible to the given one.
-        lower, upper: (n_var,) [m, rad].
+        carry: (n_var,) feasible decision vector within the bounds, as near as possible to the carry
+            around which they were searched.
+        lower, upper: (n_var,) bounds [m, rad].
         share: share of random candidates within the bounds that is feasible.
         candidates: number of candidates by which the share was measured.
     """
@@ -63,17 +64,17 @@ class Bounds:
 
 @dataclass(frozen=True)
 class Sampling:
-    """Functions and settings for measuring bounds.
+    """Functions and settings for a search for bounds by random candidates.
 
     Attributes:
-        feasible: function from decision vectors (n, n_var) to (n,) True for feasible ones on their
-            samples.
-        certain: function that returns True if one decision vector is feasible between its samples
-            too.
-        unit: (n_var,) half-widths that are scaled together [m, rad].
-        limits: (2, n_var) limits of all bounds.
-        rng: generator of candidates.
-        low, high: range of the wanted share.
+        feasible: function from decision vectors (n, n_var) to (n,) True for those whose carries are
+            feasible at all samples.
+        certain: function that returns True if the carry of one decision vector (n_var,) is feasible
+            between its samples too.
+        unit: (n_var,) half-widths of the bounds, multiplied by one common factor [m, rad].
+        limits: (2, n_var) least lower and largest upper bounds [m, rad].
+        rng: generator of random candidates.
+        low, high: wanted range of the share of random candidates that is feasible.
         out_of_time: function that returns True if no time is left.
     """
 
@@ -87,11 +88,14 @@ class Sampling:
     out_of_time: Callable[[], bool]
 
     def bounds_around(self, carry: Array) -> Bounds:
-        """Find bounds around a feasible carry (n_var,).
+        """Find bounds such that the wanted share of random candidates between them is feasible.
 
-        A common factor of the half-widths is bisected. In between the bounds move to the middle of
-        the feasible candidates, which allows wider bounds. The given carry is kept if it is within
-        the bounds, because carries in their middle are longer.
+        One common factor of the half-widths is bisected. Between bisections the bounds move to the
+        mean of the feasible candidates, which allows wider bounds. The given carry is kept if it is
+        within the bounds, because carries in their middle are longer.
+
+        Args:
+            carry: (n_var,) feasible decision vector.
         """
         scale, centre = 0.5, carry
         for _ in range(CENTRING_MOVES):
@@ -124,8 +128,16 @@ class Sampling:
         return float(np.sqrt(self.low * self.high))
 
     def _bisected(self, centre: Array, scale: float) -> tuple[float, Array]:
-        """Bisect the factor for which about the wanted share is feasible. Return it and feasible
-        candidates near it."""
+        """Bisect the factor of the half-widths for which the wanted share of candidates is
+        feasible.
+
+        Args:
+            centre: (n_var,) middle of the bounds [m, rad].
+            scale: factor at the beginning.
+
+        Returns:
+            The factor, and feasible candidates (k, n_var) at a factor near it.
+        """
         low, high, aim = LEAST_FACTOR, LARGEST_BOUND_FACTOR, self._aim
         good = np.empty((0, len(centre)))
         for _ in range(BISECTION_ROUNDS):
@@ -147,8 +159,14 @@ class Sampling:
     def _judged(
         self, centre: Array, scale: float, most: int, wanted: tuple[float, float]
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """Evaluate at most `most` random candidates. Stop earlier if the share of feasible ones is
-        surely outside the wanted range, or if no time is left.
+        """Evaluate random candidates until the share of feasible ones is surely outside a range,
+        `most` candidates are done, or no time is left.
+
+        Args:
+            centre: (n_var,) middle of the bounds [m, rad].
+            scale: factor of the half-widths.
+            most: largest number of candidates.
+            wanted: least and largest wanted share of feasible candidates.
 
         Returns:
             Candidates (n, n_var), and (n,) True for feasible ones.

@@ -33,7 +33,13 @@ LEAST_ROOM = 1e-3
 
 
 def pose_limits(pose: Array, orientation: Orientation) -> Array:
-    """Compute limits (2, 6) of bounds around a pose (6,). The pose is within them."""
+    """Compute limits (2, 6) [m, rad] that bounds around a box pose must not exceed. The pose itself
+    is within them.
+
+    Args:
+        pose: (6,) box pose [m, rad].
+        orientation: convention of the last three numbers of the pose.
+    """
     high = USUAL_POSE.copy()
     low = -high
     if orientation.is_vector:  # the farthest corner of such a cube is no longer than allowed
@@ -49,8 +55,8 @@ def pose_limits(pose: Array, orientation: Orientation) -> Array:
 
 
 def joint_limits(workcell: Workcell) -> Array:
-    """Return the limits (2, m) of the redundant joints. A joint that moves both arms has the limits
-    of both."""
+    """Return the lower and upper limits (2, m) of a cell's m redundant joints [rad or m]. A joint
+    that moves both arms has the narrower limits of both robots."""
     found = []
     for joint in workcell.task.redundant:
         driven = [
@@ -63,7 +69,15 @@ def joint_limits(workcell: Workcell) -> Array:
 
 
 def limits_around(workcell: Workcell, waypoints: Array) -> Array:
-    """Compute the limits (2, n, 6 + m) of bounds around extended poses (n, 6 + m)."""
+    """Compute limits that bounds around waypoints must not exceed.
+
+    Args:
+        workcell: the cell.
+        waypoints: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
+
+    Returns:
+        (2, n, 6 + m) lower and upper limits.
+    """
     orientation, joints = workcell.task.orientation, joint_limits(workcell)
     return np.array(
         [np.hstack([pose_limits(row[:POSE_SIZE], orientation), joints]) for row in waypoints]
@@ -71,10 +85,15 @@ def limits_around(workcell: Workcell, waypoints: Array) -> Array:
 
 
 def rounded_outwards(bounds: Array, limits: Array) -> Array:
-    """Round bounds (2, ...) to decimals, the lower down and the upper up, but not beyond limits.
+    """Round bounds to the decimals of a file, lower bounds down and upper bounds up, but not beyond
+    limits.
 
-    A decimal times `RECIPROCAL_UNIT` may differ from its integer by rounding: 1e4 * 2.8065 is
+    A decimal times `RECIPROCAL_UNIT` may differ from its integer by rounding: 1e4 times 2.8065 is
     28065.000000000004.
+
+    Args:
+        bounds: (2, ...) lower and upper bounds [m, rad].
+        limits: (2, ...) limits of the bounds [m, rad].
     """
     low, high = np.round(RECIPROCAL_UNIT * bounds, COUNTED_DECIMALS)
     return np.array(
@@ -86,9 +105,14 @@ def rounded_outwards(bounds: Array, limits: Array) -> Array:
 
 
 def readable_turns(poses: Array, orientation: Orientation) -> Array:
-    """Return poses (n, 6) with angles that a file may not contain turned back by full turns.
+    """Return box poses whose angles beyond `ANGLE_LIMIT`, which a file may not contain, are turned
+    back by full turns. Rotation vectors are left unchanged.
 
     The reader unwraps angles along the path, so the path stays the same.
+
+    Args:
+        poses: (n, 6) box poses [m, rad].
+        orientation: convention of the last three numbers of a pose.
     """
     if orientation.is_vector:
         return poses

@@ -34,16 +34,19 @@ CARRY_DECIMALS = 5
 
 @dataclass(frozen=True, eq=False)
 class Draft:
-    """A found path, with the cell in which it was found.
+    """A path found for the box, with the cell in which it was found.
 
     Attributes:
-        workcell: the cell, with chosen redundant joints.
-        spins: rotation of both pads about their normals, in addition to the file's [rad].
+        workcell: the cell, with its redundant joints chosen.
+        spins: rotation of each robot's pad about its normal, in addition to the one in the file
+            [rad].
         branches: start branch of each robot, -1 if not known yet.
-        waypoints: (n, 6 + m) extended poses, start and goal included [m, rad].
-        given: earlier additions to the problem's tables, such as bases.
+        waypoints: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m],
+            start and goal included.
+        given: additions to the problem's tables that were chosen before, such as bases.
         bounds: bounds of the decision vector; None if not known yet.
-        stand_off: stand-off of the pads [m]; None if the usual one is free, or if no tried one is.
+        stand_off: proposed stand-off of the pads [m]; None if the usual one is free, or if no tried
+            one is.
     """
 
     workcell: Workcell
@@ -56,18 +59,22 @@ class Draft:
 
     @property
     def via(self) -> Array:
-        """(n - 2, 6) poses between start and goal."""
+        """(n - 2, 6) box poses of the waypoints between start and goal [m, rad]."""
         return self.waypoints[1:-1, :POSE_SIZE]
 
     def around(self, centre: Array) -> Draft:
-        """Return the draft with the waypoints of another decision vector."""
+        """Return the draft with the waypoints of another decision vector `centre` (n_var,)."""
         m = len(self.workcell.task.redundant)
         return replace(self, waypoints=_as_waypoints(centre, self.waypoints, m))
 
 
 def changes(problem: Problem, found: Draft) -> dict[str, Any]:
-    """Return the tables that complete a problem file to a workcell with a found path: the keys to
-    be added, by table."""
+    """Return what a problem file lacks to be a workcell file with a found path: new keys by table.
+
+    Args:
+        problem: the problem.
+        found: the path, with its cell.
+    """
     poses = readable_turns(found.waypoints[:, :POSE_SIZE], found.workcell.task.orientation)
     waypoints = np.hstack([poses, found.waypoints[:, POSE_SIZE:]])
     lower, upper = _boxes(found, waypoints)
@@ -113,9 +120,15 @@ def changes(problem: Problem, found: Draft) -> dict[str, Any]:
 
 
 def decision_bounds(workcell: Workcell) -> tuple[Array, Array]:
-    """Return half-widths (n_var,) of bounds for the decision vector, to be multiplied by one
-    common factor, and the limits (2, n_var) within which bounds around the hand-made trajectory
-    must stay."""
+    """Compute how far bounds of the decision vector may reach.
+
+    Args:
+        workcell: the cell, with the hand-made trajectory.
+
+    Returns:
+        Half-widths (n_var,) of bounds, to be multiplied by one common factor [m, rad], and limits
+        (2, n_var) that the bounds must not exceed.
+    """
     task, n = workcell.task, len(workcell.task.waypoints)
     poses = [pose_limits(pose, task.orientation) for pose in task.initial]
     joints = np.repeat(joint_limits(workcell), n, axis=1)
@@ -124,8 +137,12 @@ def decision_bounds(workcell: Workcell) -> tuple[Array, Array]:
 
 
 def _boxes(found: Draft, waypoints: Array) -> Array:
-    """Compute bounds (2, n, 6 + m) of waypoints (n, 6 + m), rounded to decimals that the reader
-    accepts."""
+    """Compute lower and upper bounds (2, n, 6 + m) of waypoints, rounded to the decimals of a file.
+
+    Args:
+        found: the draft; without bounds of its own, a fixed range about each waypoint is taken.
+        waypoints: (n, 6 + m) box poses [m, rad] and redundant joints [rad or m].
+    """
     bounds = np.array([waypoints - DRAFT_ROOM, waypoints + DRAFT_ROOM])
     if found.bounds is not None:
         both, m = (found.bounds.lower, found.bounds.upper), len(found.workcell.task.redundant)
@@ -134,8 +151,14 @@ def _boxes(found: Draft, waypoints: Array) -> Array:
 
 
 def _as_waypoints(x: Array, waypoints: Array, m: int) -> Array:
-    """Compute extended waypoints (n, 6 + m) of a decision vector in which every inner waypoint and
-    all values of redundant joints are free."""
+    """Replace all free values of waypoints by those of a decision vector: the inner box poses and
+    every redundant joint.
+
+    Args:
+        x: (n_var,) decision vector [m, rad].
+        waypoints: (n, 6 + m) waypoints, whose first and last box poses are kept [m, rad].
+        m: number of redundant joints.
+    """
     n = len(waypoints)
     placed = waypoints.copy()
     placed[1:-1, :POSE_SIZE] = x[: POSE_SIZE * (n - 2)].reshape(n - 2, POSE_SIZE)
@@ -144,5 +167,5 @@ def _as_waypoints(x: Array, waypoints: Array, m: int) -> Array:
 
 
 def _plain(values: Array) -> Any:
-    """Convert values to lists of numbers without -0.0."""
+    """Convert an array to nested lists of numbers, with 0.0 in place of -0.0."""
     return (values + 0.0).tolist()

@@ -34,20 +34,35 @@ GUIDE_POSES = 25
 
 
 def possible_spins(contact: Contact, spins: Array) -> Array:
-    """Return those of spins (n,) [rad] with which the rotated pads of an arm cover the same patches
-    as before: every spin of one round pad, half turns of a rectangular pad, quarter turns of a
-    square array of cups."""
+    """Select rotations of an arm's pads about their normals with which the pads cover the same
+    patches as before: all for one round pad, half turns for a rectangular pad, quarter turns for a
+    square array of cups.
+
+    Args:
+        contact: contact of the arm.
+        spins: (n,) rotations [rad].
+
+    Returns:
+        (k,) the selected rotations [rad].
+    """
     same = [covers_the_same(contact, rotate_about_normal(contact, float(spin))) for spin in spins]
     return np.asarray(spins[same])
 
 
 def clear_spins(query: HoldQuery, kinematics: ArmKinematics, spins: Array) -> Array:
-    """Return those of spins (n,) [rad] with which hand, tool and pad, the bodies fixed to the arm's
-    last joint, neither enter the payload nor collide with fixed bodies, at the start and at the
-    goal. All spins are returned if none is clear.
+    """Select rotations of an arm's pads about their normals with which hand, tool and pad neither
+    enter the payload nor collide with fixed bodies, at start and goal. If none is clear, all are
+    returned.
 
-    Within a shelf only a few of twelve spins are clear, and all random starts are then spent on
-    these.
+    Within a shelf few rotations are clear. A search then tries only these.
+
+    Args:
+        query: box poses at start and goal.
+        kinematics: the arm.
+        spins: (n,) rotations [rad].
+
+    Returns:
+        (k,) the selected rotations [rad].
     """
     if query.judge is None:
         return spins
@@ -84,8 +99,17 @@ def clear_spins(query: HoldQuery, kinematics: ArmKinematics, spins: Array) -> Ar
 
 
 def initial_arc(start: Array, goal: Array, bow: Array) -> Array:
-    """Compute a path (GUIDE_POSES, 6 + m) from one extended pose to another that is displaced by
-    `bow` (3,) [m] in the middle."""
+    """Compute a path from one extended pose to another that bends aside in the middle.
+
+    Args:
+        start: (6 + m,) first extended pose: box pose [m, rad] and the m redundant joints [rad or
+            m].
+        goal: (6 + m,) last extended pose.
+        bow: (3,) displacement of the box in the middle of the path, world frame [m].
+
+    Returns:
+        (GUIDE_POSES, 6 + m) extended poses.
+    """
     poses = np.linspace(start, goal, GUIDE_POSES)
     poses[:, :3] += np.sin(np.linspace(0.0, np.pi, GUIDE_POSES))[:, None] * bow
     return poses
@@ -131,11 +155,11 @@ LIMIT_MARGIN = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Hold:
-    """One way for one arm to hold the box.
+    """Postures of one arm at start and goal between which it can hold the box all the way.
 
     Attributes:
         spin: rotation of the pad about its normal, in addition to the file's [rad].
-        q_start, q_goal: (joints,) postures at both ends of the carry, which a guide connects [rad
+        q_start, q_goal: (joints,) postures at start and goal, connected along one of `GUIDES` [rad
             or m].
         score: larger is better.
     """
@@ -148,18 +172,19 @@ class Hold:
 
 @dataclass
 class HoldSearch:
-    """Result of the search for the holds of one arm.
+    """Result of the search for the holds of one arm, and counts that explain a failure.
 
     Attributes:
         holds: the holds, best first.
-        within: number of postures that hold the box at the start, within limits and away from
+        within: number of postures at the start that hold the box, within joint limits and away from
             singularities.
-        free: number of these postures that are free of collisions.
-        joints: number of postures in which each joint was beyond its limits, by index.
-        pairs: number of collisions by pair at the start; at the goal if no posture reaches it.
-        kept: largest share of the straight line that a collision-free posture follows.
-        stopped: reason why this posture cannot be followed farther.
-        manipulability: largest manipulability at the start of a posture within limits [m^3].
+        free: number of those postures that do not collide.
+        joints: number of postures beyond the limits of a joint, by index of the joint.
+        pairs: number of collisions by pair of bodies, at the start and at the goal.
+        kept: largest share of a guide, a path of the box from start to goal, that a collision-free
+            posture follows.
+        stopped: reason why the posture that came farthest stops there.
+        manipulability: largest manipulability of a posture at the start within joint limits [m^3].
     """
 
     holds: list[Hold] = field(default_factory=list)
@@ -177,13 +202,14 @@ class HoldQuery:
     """The box poses that an arm has to hold, and the effort of the search.
 
     Attributes:
-        start, goal: (6,) box poses [m, rad].
-        spins: rotations of the pad about its normal, in addition to the file's [rad].
+        start, goal: (6,) box poses in the world [m, rad].
+        spins: (n,) rotations of the pad about its normal that are tried, in addition to the one in
+            the file [rad].
         judge: checker of collisions; None if collisions do not count.
         starts: number of random starts of the search for postures.
-        guides: number of `GUIDES` that are tried.
-        common: (2, k) positions of the joints that move both arms, at the start and at the goal
-            [rad or m]; None if they are free like other redundant joints.
+        guides: number of box paths from `GUIDES` that are tried.
+        common: (2, k) positions of the k joints that also move the other arm, at the start and at
+            the goal [rad or m]; None if these joints are free like other redundant joints.
     """
 
     start: Array
@@ -196,8 +222,14 @@ class HoldQuery:
 
 
 def find_holds(query: HoldQuery, kinematics: ArmKinematics, rng: np.random.Generator) -> HoldSearch:
-    """Find the holds with which an arm can carry the box from start to goal. The other arm is left
-    out."""
+    """Find the postures with which an arm can hold the box from start to goal. Collisions with the
+    other arm do not count.
+
+    Args:
+        query: box poses and effort of the search.
+        kinematics: the arm.
+        rng: generator of random postures.
+    """
     finder = _Finder(query, kinematics, rng)
     found, contact = finder.found, kinematics.workcell.contacts[kinematics.arm]
     spins = clear_spins(query, kinematics, possible_spins(contact, query.spins))
@@ -230,7 +262,16 @@ class _Finder:
         self._orientation = kinematics.workcell.task.orientation
 
     def start_postures(self, T_box_joint: Sequence[Array]) -> tuple[Array, NDArray[np.intp]]:
-        """Find distinct postures at the start, and the index of the spin of each."""
+        """Find distinct postures that hold the box at the start.
+
+        Args:
+            T_box_joint: pose (4, 4) of the last joint in the box frame, for each rotation of the
+                pad.
+
+        Returns:
+            Postures (n, joints) [rad or m], and the index (n,) of each one's entry in
+            `T_box_joint`.
+        """
         kinematics, found, start = self.kinematics, self.found, self.query.start
         T_world_box = box_placement(self._orientation, start)
         which = np.arange(self.query.starts) % len(T_box_joint)
@@ -264,8 +305,16 @@ class _Finder:
         return q[kept], which[kept]
 
     def colliding(self, pose: Array, q: Array) -> NDArray[np.bool_]:
-        """Return a mask (n,) that is True for postures (n, joints) that collide while they hold the
-        box at a pose. Collisions are counted by pair."""
+        """Find postures in which the arm collides while it holds the box, and count these
+        collisions by pair of bodies.
+
+        Args:
+            pose: (6,) pose of the box [m, rad].
+            q: (n, joints) postures [rad or m].
+
+        Returns:
+            (n,) True for postures that collide.
+        """
         judge, arm = self.query.judge, self.kinematics.arm
         if judge is None or not len(q):
             return np.zeros(len(q), dtype=bool)
@@ -279,13 +328,13 @@ class _Finder:
         return hit
 
     def lead(self, spin: Array, T_box_joint: Array, q: Array) -> None:
-        """Follow postures along guides to the goal, until enough arrive. Those that arrive become
-        holds.
+        """Move the arm from each posture along guides, paths of the box to the goal, until enough
+        postures arrive. Each that arrives without collision becomes a hold.
 
         Args:
-            spin: (n,) spin of each posture [rad].
-            T_box_joint: (n, 4, 4) last joint in the box frame, for each posture.
-            q: (n, joints) postures [rad or m].
+            spin: (n,) rotation of the pad about its normal, for each posture [rad].
+            T_box_joint: (n, 4, 4) pose of the last joint in the box frame, for each posture.
+            q: (n, joints) postures at the start [rad or m].
         """
         start, goal = self.query.start, self.query.goal
         waiting = np.arange(len(q))
@@ -310,8 +359,16 @@ class _Finder:
             waiting = np.delete(waiting, arrived)
 
     def _followed(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
-        """Return the indices of the postures that arrive, their joint paths (m, n, joints) and
-        scores (n,)."""
+        """Move the arm from n postures along m given poses of its last joint.
+
+        Args:
+            targets: (m, n, 4, 4) poses of the last joint in the world.
+            q: (n, joints) postures at the first pose [rad or m].
+
+        Returns:
+            Indices of the postures that reach the last pose; joint paths (m, n, joints) [rad or m];
+            scores (n,).
+        """
         kinematics, redundant = self.kinematics, list(self.kinematics.redundant)
         ends = None
         if redundant:  # half of them keep their redundant joints, half move them elsewhere
@@ -339,7 +396,13 @@ class _Finder:
         return arrived, path, self._score(path, room, measure)
 
     def _stop(self, q: Array, measure: float, reaches: bool) -> str:
-        """Return the reason why a posture (joints,) cannot be part of a path."""
+        """Return the reason why a posture cannot be part of a path.
+
+        Args:
+            q: (joints,) posture [rad or m].
+            measure: manipulability, negative beyond a singular posture [m^3].
+            reaches: True if the arm reaches the pose of the box there.
+        """
         kinematics = self.kinematics
         if not reaches:
             return "it does not reach farther in one motion"
@@ -352,8 +415,17 @@ class _Finder:
         return f"{joint} is at its limit there"
 
     def _resolved(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
-        """Follow postures like `_followed`, with redundant joints resolved at every pose. Only the
-        ends count, because the planned path between them may differ."""
+        """Move the arm as `_followed` does, with redundant joints chosen anew at every pose. Limits
+        count at the last pose only, because the planned path may differ from these paths.
+
+        Args:
+            targets: (m, n, 4, 4) poses of the last joint in the world.
+            q: (n, joints) postures at the first pose [rad or m].
+
+        Returns:
+            Indices of the postures that reach the last pose; joint paths (m, n, joints) [rad or m];
+            scores (n,).
+        """
         ends = None
         if self.query.common is not None:
             ends = q[:, list(self.kinematics.redundant)]
@@ -366,20 +438,34 @@ class _Finder:
         return arrived, path, self._score(path, room, measure)
 
     def _place_common(self, ends: Array) -> None:
-        """Set the common joints among the redundant joints (n, redundant) to their positions at the
-        goal."""
+        """Overwrite, in place, the joints that also move the other arm with their positions at the
+        goal.
+
+        Args:
+            ends: (n, redundant) positions of the redundant joints at the goal [rad or m].
+        """
         if self.query.common is not None:
             columns = [self.kinematics.redundant.index(k) for k in self.kinematics.common]
             ends[:, columns] = self.query.common[1]
 
     def _room(self, path: Array) -> Array:
-        """Compute the least distance (m, n) to a joint limit along joint paths (m, n, joints)."""
+        """Compute the distance of each posture from the nearest joint limit, (m, n) [rad or m],
+        along n joint paths (m, n, joints)."""
         beyond = np.minimum(path - self.kinematics.lower, self.kinematics.upper - path)
         return np.asarray(beyond.min(axis=2))
 
     def _score(self, path: Array, room: Array, measure: Array) -> Array:
-        """Score paths (n,) by their distance from limits and singular postures, and by the distance
-        between their ends."""
+        """Score n joint paths: far from limits and singular postures, with ends near each other, is
+        better.
+
+        Args:
+            path: (m, n, joints) joint paths [rad or m].
+            room: (m, n) distance from the nearest joint limit [rad or m].
+            measure: (m, n) manipulability [m^3].
+
+        Returns:
+            (n,) scores; larger is better.
+        """
         comfort = np.clip(room.min(axis=0), 0.0, 0.6) / 0.6
         away = np.minimum(measure.min(axis=0) / (4.0 * self.kinematics.least), 1.0)
         apart = np.linalg.norm(path[-1] - path[0], axis=1)
@@ -387,7 +473,13 @@ class _Finder:
 
 
 def manipulability_hint(kinematics: ArmKinematics, found: str) -> str:
-    """Return a sentence on a manipulability that is too small, with the key of its limit."""
+    """Return a sentence on a manipulability that is too small, with the key of its limit in the
+    file.
+
+    Args:
+        kinematics: the arm.
+        found: part of the sentence on the manipulability found, such as 'is 0.01 m^3 there'.
+    """
     robot = kinematics.workcell.robots[kinematics.arm]
     return (
         f"abs(det J) {found}, too near a singular posture; allowed is {MANIPULABILITY_MARGIN:g} "
@@ -396,11 +488,12 @@ def manipulability_hint(kinematics: ArmKinematics, found: str) -> str:
 
 
 def _diverse(holds: Sequence[Hold], compared: int) -> list[Hold]:
-    """Sort holds such that holds unlike all earlier ones come first. Of holds that differ only in
-    the spin and in a joint about the same axis, the best is kept.
+    """Sort holds such that those which differ much from all before come first. Of nearly equal
+    holds only the first is kept.
 
     Args:
-        compared: number of joints, from the first, that distinguish holds.
+        holds: the holds, best first.
+        compared: number of joints, counted from the base, by which start postures are compared.
     """
     first: list[Hold] = []
     later: list[Hold] = []

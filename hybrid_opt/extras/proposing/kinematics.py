@@ -39,13 +39,14 @@ SAME_PATCH = 1e-6
 
 @dataclass(frozen=True)
 class Postures:
-    """n postures of one arm.
+    """n postures of one arm, and how well each puts the last joint at its wanted placement.
 
     Attributes:
-        q: (n, joints) [rad or m].
-        residual: (n,) pose residual [m, rad].
-        determinant: (n,) det J of the six joints that follow [m^3]. If its sign changes along a
-            path, the arm passes a singular posture.
+        q: (n, joints) joint positions [rad or m].
+        residual: (n,) distance of the last joint from its wanted placement: root of the squared
+            position error [m] plus the squared rotation error [rad].
+        determinant: (n,) determinant of the Jacobian of the six joints that are not redundant
+            [m^3]. If its sign changes along a path, the arm passes a singular posture.
     """
 
     q: Array
@@ -54,7 +55,7 @@ class Postures:
 
     @property
     def manipulability(self) -> Array:
-        """(n,) abs(det J) [m^3]."""
+        """(n,) manipulability of each posture: the absolute value of `determinant` [m^3]."""
         return np.abs(self.determinant)
 
 
@@ -64,12 +65,13 @@ class ArmKinematics:
     Attributes:
         workcell: the cell.
         arm: index of the arm.
-        geometry: joints of the arm.
-        redundant: indices of the redundant joints; the other six follow the box.
-        common: indices of the redundant joints that move the other arm too, in the order of the
-            task.
-        lower, upper: (joints,) limits [rad or m].
-        least: least manipulability of a first path [m^3].
+        geometry: joint axes and limits of the arm, and the transform to the box that it holds.
+        redundant: indices of the redundant joints; the other six are solved for the box pose.
+        common: indices of the redundant joints that also move the other arm, in the order of the
+            task's redundant joints.
+        lower, upper: (joints,) joint limits [rad or m].
+        least: least manipulability of a hold [m^3], `MANIPULABILITY_MARGIN` times the robot's
+            `min_manipulability`.
     """
 
     def __init__(self, workcell: Workcell, arm: int, geometry: ArmGeometry | None = None) -> None:
@@ -82,13 +84,22 @@ class ArmKinematics:
         self.least = workcell.robots[arm].min_manipulability * MANIPULABILITY_MARGIN
 
     def moved(self, T_world_root: Array) -> ArmKinematics:
-        """Return the arm with another placement T_world_root (4, 4)."""
+        """Return the same arm with its root, the frame in which the first joint is fixed, at
+        another place.
+
+        Args:
+            T_world_root: (4, 4) pose of the root in the world.
+        """
         geometry = replace(self.geometry, T_world_root=T_world_root)
         return ArmKinematics(self.workcell, self.arm, geometry)
 
     def held(self, spin: float = 0.0) -> Array:
-        """Compute T_box_joint (4, 4), the arm's last joint in the frame of the box that it holds,
-        with the pad rotated about its normal by `spin` [rad]."""
+        """Compute T_box_joint (4, 4), the pose in the box frame of the arm's last joint while the
+        arm holds the box.
+
+        Args:
+            spin: rotation of the pad about its normal, in addition to the one in the file [rad].
+        """
         contact = self.workcell.contacts[self.arm]
         # The geometry's own contact is replaced by the one asked for.
         T_pad_joint = inverse(contact.T_box_pad) @ inverse(self.geometry.T_joint_box)
@@ -96,18 +107,25 @@ class ArmKinematics:
 
     @property
     def span(self) -> Array:
-        """(2, joints) lower and upper joint limits, clipped to plus and minus half a turn [rad or
-        m]."""
+        """(2, joints) lower and upper joint limits, each clipped to [-pi, pi] [rad or m]."""
         return np.array([np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)])
 
     def drawn(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw random postures (count, joints) within `span` [rad or m]."""
+        """Draw `count` random postures (count, joints), uniform between the limits of `span` [rad
+        or m]."""
         low, high = self.span
         return rng.uniform(low, high, (count, len(low)))
 
     def chain(self, q: Array) -> tuple[Array, Array]:
-        """Compute origins and axes (n, joints, 6) of the joints and the last joint's placement (n,
-        4, 4), in the world."""
+        """Compute the place of every joint of the arm in the world.
+
+        Args:
+            q: (n, joints) joint positions [rad or m].
+
+        Returns:
+            Origin [m] and unit axis of every joint side by side (n, joints, 6), and the pose (n, 4,
+            4) of the last joint's frame.
+        """
         n, arm = len(q), self.geometry
         T = np.broadcast_to(arm.T_world_root, (n, 4, 4))
         points, axes = np.empty((n, arm.joints, 3)), np.empty((n, arm.joints, 3))
@@ -126,8 +144,13 @@ class ArmKinematics:
         return np.concatenate([points, axes], axis=2), T
 
     def jacobian(self, frames: Array, T: Array) -> Array:
-        """Compute the Jacobian (n, 6, joints) of the last joint's origin, along world axes, from
-        the results of `chain`."""
+        """Compute the Jacobian (n, 6, joints) of the last joint's frame: linear velocity of its
+        origin, then angular velocity, along world axes, per joint velocity [m/rad, 1].
+
+        Args:
+            frames: (n, joints, 6) joint origins and axes from `chain`.
+            T: (n, 4, 4) pose of the last joint's frame from `chain`.
+        """
         points, axes = frames[:, :, :3], frames[:, :, 3:]
         turning = np.array(self.geometry.turning)[:, None]
         across = np.cross(axes, T[:, None, :3, 3] - points)
@@ -135,19 +158,24 @@ class ArmKinematics:
         return np.concatenate([linear, np.where(turning, axes, 0.0)], axis=2).transpose(0, 2, 1)
 
     def side(self, q: Array) -> float:
-        """Return the sign of det J in a posture (joints,). A path on which it changes passes a
-        singular posture."""
+        """Return the sign of the determinant of the six non-redundant joints' Jacobian. A path
+        along which this sign changes passes a singular posture.
+
+        Args:
+            q: (joints,) posture [rad or m].
+        """
         return float(
             np.sign(np.linalg.det(self.jacobian(*self.chain(q[None]))[0][:, self.following]))
         )
 
     def solve(self, q: Array, target: Array, steps: int, damping: float = 0.0) -> Postures:
-        """Find postures with which the last joint has the wanted placements, by Newton's method.
+        """Find postures that put the last joint at given poses, by Newton's method. Redundant
+        joints keep their initial positions.
 
         Args:
             q: (n, joints) initial postures [rad or m].
-            target: (n, 4, 4) wanted placements of the last joint in the world.
-            steps: number of steps.
+            target: (n, 4, 4) wanted poses of the last joint in the world.
+            steps: largest number of Newton steps.
             damping: 0 for pure Newton steps; small values stabilise starts far from a solution.
         """
         q = np.array(q, dtype=float)
@@ -166,11 +194,16 @@ class ArmKinematics:
         return Postures(q, residual, np.linalg.det(J))
 
     def track(self, q: Array, target: Array, held: Sequence[int] = ()) -> Postures:
-        """Find the next postures (n, joints) near q at placements (n, 4, 4) of the last joint. All
-        joints move except those in `held`.
+        """Find the postures near q that put the last joint at given poses. All joints move,
+        redundant ones too, except those in `held`.
 
-        Steps have least norm and drift to the middle of the joint ranges as far as the box leaves
-        joints free.
+        Newton steps have least norm. The first one also moves the joints towards the middle of
+        their ranges, as far as the poses leave them free.
+
+        Args:
+            q: (n, joints) postures before [rad or m].
+            target: (n, 4, 4) wanted poses of the last joint in the world.
+            held: indices of the joints that do not move.
         """
         q = np.array(q, dtype=float)
         middle = (self.lower + self.upper) / 2.0
@@ -193,18 +226,19 @@ class ArmKinematics:
     def follow(
         self, q: Array, targets: Array, ends: Array | None = None, resolved: bool = False
     ) -> tuple[Array, NDArray[np.intp], Array]:
-        """Follow m placements of the last joint from n postures, pose by pose.
+        """Move the last joint through m given poses in the world, from each of n postures.
 
         Args:
-            q: (n, joints) postures at the first placement [rad or m].
-            targets: (m, 4, 4) placements for all postures, or (m, n, 4, 4) for each posture.
-            ends: (n, redundant) final positions of the redundant joints; None if they do not move.
-            resolved: True if redundant joints move freely such that joints stay near the middle of
-                their ranges; common joints only without `ends`.
+            q: (n, joints) postures at the first pose [rad or m].
+            targets: (m, 4, 4) poses for all postures, or (m, n, 4, 4) for each posture.
+            ends: (n, redundant) positions of the redundant joints at the last pose [rad or m],
+                reached at an even rate; None if they do not move.
+            resolved: True if redundant joints move freely, near the middle of their ranges. Joints
+                that also move the other arm then follow `ends`, or move freely if that is None.
 
         Returns:
-            Joint paths (m, n, joints); for each posture the number of placements reached without a
-            jump; manipulability (m, n), negative beyond a singular posture.
+            Joint paths (m, n, joints) [rad or m]; number (n,) of poses that each posture reaches
+            before a joint jumps; manipulability (m, n) [m^3], negative beyond a singular posture.
         """
         m, n = len(targets), len(q)
         path, measure = np.tile(q, (m, 1, 1)), np.zeros((m, n))
@@ -234,8 +268,14 @@ class ArmKinematics:
         return path, kept, measure
 
     def central(self, path: Array) -> Array:
-        """Compute the full turns (n, joints) [rad] that bring joint paths (m, n, joints) nearest to
-        the middle of the limits; zero for prismatic joints."""
+        """Compute the full turns that bring joint paths nearest to the middle of the joint limits.
+
+        Args:
+            path: (m, n, joints) n joint paths of m poses each [rad or m].
+
+        Returns:
+            Angles (n, joints) to add to each path [rad]; zero for sliding and for redundant joints.
+        """
         middle = (self.lower + self.upper) / 2.0
         turns = np.round((middle - (path.min(axis=0) + path.max(axis=0)) / 2.0) / (2.0 * np.pi))
         free = np.array(self.geometry.turning)
@@ -244,8 +284,8 @@ class ArmKinematics:
 
 
 def rotate_about_normal(contact: Contact, spin: float) -> Contact:
-    """Return a contact with its pad rotated about its normal by an angle [rad]. If the contact has
-    several pads, they rotate together about their middle."""
+    """Return a contact whose pad is rotated about its normal by an angle `spin` [rad]. Several pads
+    of one contact rotate together about their middle."""
     turn = pose_matrix(np.zeros(3), np.array([0.0, 0.0, spin]))
     if not contact.further:
         return replace(contact, T_box_pad=contact.T_box_pad @ turn)
@@ -255,14 +295,18 @@ def rotate_about_normal(contact: Contact, spin: float) -> Contact:
 
 
 def moved(contact: Contact, motion: Array) -> Contact:
-    """Return a contact with all its pads moved by a transform (4, 4), in the box frame."""
+    """Return a contact with all its pads moved by a transform.
+
+    Args:
+        motion: (4, 4) transform in the box frame, applied to each T_box_pad from the left.
+    """
     further = tuple(replace(pad, T_box_pad=motion @ pad.T_box_pad) for pad in contact.further)
     return replace(contact, T_box_pad=motion @ contact.T_box_pad, further=further)
 
 
 def covers_the_same(contact: Contact, other: Contact) -> bool:
-    """Return True if two contacts have pads of the same kind that cover the same patches, in any
-    order."""
+    """Return True if every pad of one contact has a pad of the other that covers the same patch.
+    The order of the pads does not count."""
 
     def alike(a: Contact, b: Contact) -> bool:
         apart = np.abs(a.T_box_pad[:3, 2:] - b.T_box_pad[:3, 2:]).max()
@@ -274,8 +318,8 @@ def covers_the_same(contact: Contact, other: Contact) -> bool:
 
 
 def shoulder_positions(robots: tuple[Robot, Robot]) -> Array:
-    """Return the position (2, 3) of the first joint that moves only one arm, for each arm in the
-    world [m], with all joints at the middle of their ranges."""
+    """Compute the shoulder position of each arm in the world (2, 3) [m]: the origin of the first
+    joint that moves this arm only. All joints are at the middle of their ranges."""
     found = []
     for robot in robots:
         model = arm_model(robot)
@@ -287,7 +331,7 @@ def shoulder_positions(robots: tuple[Robot, Robot]) -> Array:
 
 
 def has_wrist_spin(kinematics: ArmKinematics) -> bool:
-    """Return True if the arm's last joint rotates the pad about its normal."""
+    """Return True if the arm's last joint rotates the pad about its normal and is not redundant."""
     geometry, contact = kinematics.geometry, kinematics.workcell.contacts[kinematics.arm]
     T_joint_pad = geometry.T_joint_box @ contact.T_box_pad
     axis = geometry.axes[-1]
@@ -305,8 +349,16 @@ def _turns(axis: Array, angle: Array) -> Array:
 
 
 def _error(target: Array, T: Array) -> tuple[Array, Array]:
-    """Return the pose errors (n, 6) of placements T (n, 4, 4), the right-hand side of Newton's
-    equations, and their residuals (n,) [m, rad]."""
+    """Compute the error between wanted and actual poses.
+
+    Args:
+        target: (n, 4, 4) wanted poses.
+        T: (n, 4, 4) actual poses.
+
+    Returns:
+        Position and rotation errors side by side (n, 6) [m, rad] for Newton's equations, and the
+        norm (n,) of both errors of each pose.
+    """
     R, R_target = T[:, :3, :3], target[:, :3, :3]
     dR = R_target @ R.transpose(0, 2, 1)
     axis = np.stack(

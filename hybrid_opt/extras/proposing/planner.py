@@ -51,11 +51,12 @@ CHAIN_NEWTON_STEPS = 8
 
 @dataclass(frozen=True, eq=False)
 class ChainConfiguration:
-    """A configuration of the closed chain.
+    """Box pose and joint positions of both arms while both hold the box.
 
     Attributes:
-        extended: (6 + m,) box pose [m, rad] and redundant joints [rad or m].
-        q: joints (n,) of each arm [rad or m].
+        extended: (6 + m,) extended pose: the box pose [m, rad] followed by the m redundant joints
+            [rad or m].
+        q: joint positions (joints,) of each arm [rad or m].
     """
 
     extended: Array
@@ -80,8 +81,16 @@ class _Follower:
         self.lower, self.upper = many.lower + LIMIT_MARGIN, many.upper - LIMIT_MARGIN
 
     def close(self, T_world_box: Array, extended: Array, q: Array) -> Array | str:
-        """Return the joints near q with which the arm holds the box at T_world_box, or a text with
-        the reason why there are none."""
+        """Find the joint positions near q with which the arm holds the box.
+
+        Args:
+            T_world_box: (4, 4) pose of the box.
+            extended: (6 + m,) extended pose, of which the redundant joints are used [rad or m].
+            q: (joints,) joint positions at a configuration nearby [rad or m].
+
+        Returns:
+            The joint positions (joints,); or a text that says why there are none.
+        """
         target = self.T_root_world @ T_world_box @ self.T_box_joint
         before, q = q, q.copy()
         for joint, place in self.redundant:
@@ -116,12 +125,14 @@ class _Follower:
 
 
 class ClosedChain:
-    """Both arms with one pair of holds. Threads must not share one.
+    """Both arms with the box between them, each with a fixed hold. Not safe to share between
+    threads.
 
     Attributes:
         judge: checker of collisions.
-        looked: number of checked configurations.
-        refused: number of refused configurations by reason, collisions excluded.
+        looked: number of configurations checked so far.
+        refused: number of configurations at which the arms cannot hold the box, by reason;
+            collisions do not count.
     """
 
     def __init__(
@@ -131,7 +142,7 @@ class ClosedChain:
         holds: tuple[Hold, Hold],
         models: tuple[pin.Model, pin.Model],
     ) -> None:
-        """Prepare both arms.
+        """Prepare the kinematics of both arms.
 
         Args:
             workcell: the cell, with chosen redundant joints.
@@ -148,8 +159,13 @@ class ClosedChain:
         ]
 
     def close(self, extended: Array, q: tuple[Array, Array]) -> ChainConfiguration | None:
-        """Return the configuration at an extended pose (6 + m,) near joints q; None if the chain
-        does not close. Collisions do not count."""
+        """Return the configuration in which both arms hold the box at an extended pose; None if an
+        arm cannot. Collisions are not checked.
+
+        Args:
+            extended: (6 + m,) extended pose [m, rad; rad or m].
+            q: joint positions (joints,) of each arm at a configuration nearby [rad or m].
+        """
         T_world_box = box_placement(self._orientation, extended[:POSE_SIZE])
         found = []
         for arm, near in zip(self._arms, q, strict=True):
@@ -163,16 +179,17 @@ class ClosedChain:
     def close_many(
         self, extended: Array, q: tuple[Array, Array], steps: int = TRACKING_STEPS
     ) -> tuple[tuple[Array, Array], NDArray[np.bool_]]:
-        """Close the chain at n extended poses together, near given joints. Collisions do not count.
+        """Find the joint positions with which both arms hold the box at n extended poses.
+        Collisions are not checked.
 
         Args:
-            extended: (n, 6 + m) extended poses.
-            q: joints (n, joints) of each arm [rad or m].
+            extended: (n, 6 + m) extended poses [m, rad; rad or m].
+            q: joint positions (n, joints) of each arm from which the solution starts [rad or m].
             steps: largest number of Newton steps.
 
         Returns:
-            Joints (n, joints) of each arm, and (n,) True for configurations that close within joint
-            limits.
+            Joint positions (n, joints) of each arm, and (n,) True where both arms hold the box
+            within their joint limits.
         """
         T_world_box = box_placement(self._orientation, extended[:, :POSE_SIZE])
         closed, found = np.ones(len(extended), dtype=bool), []
@@ -188,8 +205,13 @@ class ClosedChain:
         return (found[0], found[1]), closed
 
     def along(self, begin: ChainConfiguration, path: Array) -> Iterator[ChainConfiguration]:
-        """Yield configurations along extended poses (n, 6 + m) as long as they are free. The first
-        pose is that of `begin`."""
+        """Yield the configurations along a path, up to the first that collides or at which an arm
+        cannot hold the box.
+
+        Args:
+            begin: configuration at the first pose of the path.
+            path: (n, 6 + m) extended poses [m, rad; rad or m].
+        """
         batch: list[ChainConfiguration] = []
         place: ChainConfiguration | None = begin
         for extended in path:
@@ -209,14 +231,15 @@ class ClosedChain:
     def along_many(
         self, begins: Sequence[ChainConfiguration], paths: Array
     ) -> list[list[ChainConfiguration]]:
-        """Follow k paths side by side, each as far as it is free.
+        """Follow k paths at once, each up to its first configuration that collides or at which an
+        arm cannot hold the box.
 
         Args:
             begins: configuration at the beginning of each path.
-            paths: (k, n, 6 + m) extended poses, at most `PATH_STEP` apart.
+            paths: (k, n, 6 + m) extended poses, neighbours at most `PATH_STEP` apart.
 
         Returns:
-            Configurations along each path, beginning included.
+            Configurations along each path, the one in `begins` first.
         """
         found = [[begin] for begin in begins]
         alive = np.arange(len(begins))
@@ -238,8 +261,14 @@ class ClosedChain:
     def between(
         self, first: ChainConfiguration, last: ChainConfiguration, path: Array
     ) -> list[ChainConfiguration] | None:
-        """Return the configurations along a path (n, 6 + m) between two configurations; None if not
-        all are free, or if the joints do not arrive at the second one."""
+        """Return the configurations along a path from one configuration to another; None if one of
+        them collides or an arm cannot hold the box, or if the joints do not arrive at `last`.
+
+        Args:
+            first: configuration at the first pose of the path.
+            last: configuration at the last pose of the path.
+            path: (n, 6 + m) extended poses [m, rad; rad or m].
+        """
         share = np.linspace(0.0, 1.0, len(path))[:, None]
         near = [(1.0 - share) * a + share * b for a, b in zip(first.q, last.q, strict=True)]
         q, closed = self.close_many(path, (near[0], near[1]), CHAIN_NEWTON_STEPS)
@@ -255,14 +284,24 @@ class ClosedChain:
         return [first, *places[1:-1], last] if free else None
 
     def reach(self, begin: ChainConfiguration, extended: Array) -> ChainConfiguration | None:
-        """Return the configuration at the end of a straight motion from `begin`; None if the motion
-        is not free."""
+        """Return the configuration at the end of a straight motion; None if the motion is not free
+        of collisions or an arm cannot follow it.
+
+        Args:
+            begin: configuration at the beginning of the motion.
+            extended: (6 + m,) extended pose at the end [m, rad; rad or m].
+        """
         found = self.way(begin, straight(begin.extended, extended))
         return None if found is None else found[-1]
 
     def way(self, begin: ChainConfiguration, path: Array) -> list[ChainConfiguration] | None:
-        """Return the configurations along extended poses (n, 6 + m) that begin at `begin`; None if
-        not all are free."""
+        """Return the configurations along a whole path; None if one of them collides or an arm
+        cannot hold the box there.
+
+        Args:
+            begin: configuration at the first pose of the path.
+            path: (n, 6 + m) extended poses [m, rad; rad or m].
+        """
         found = [begin, *self.along(begin, path[1:])]
         return found if len(found) == len(path) else None
 
@@ -277,20 +316,29 @@ class ClosedChain:
 
 
 def metric_weights(size: int) -> Array:
-    """Return the weight (size,) of each entry of an extended pose in a distance."""
+    """Return the factors (size,) that turn the entries of an extended pose into lengths: 1 for
+    positions, a lever [m/rad] for angles and for redundant joints.
+
+    Args:
+        size: number of entries, 6 plus the number of redundant joints.
+    """
     found = np.full(size, REDUNDANT_LEVER)
     found[:3], found[3:POSE_SIZE] = 1.0, LEVER
     return found
 
 
 def distance(first: Array, second: Array) -> float:
-    """Compute the weighted distance between extended poses [m]."""
+    """Compute the distance between two extended poses (6 + m,), weighted by `metric_weights`
+    [m]."""
     return float(np.linalg.norm(metric_weights(len(first)) * (second - first)))
 
 
 def straight(first: Array, second: Array) -> Array:
-    """Return extended poses (n, 6 + m) on the straight line, at most `PATH_STEP` apart, ends
-    included."""
+    """Interpolate linearly between two extended poses (6 + m,), ends included.
+
+    Returns:
+        (n, 6 + m) extended poses, neighbours at most `PATH_STEP` apart.
+    """
     n = max(int(np.ceil(distance(first, second) / PATH_STEP)), 1)
     return np.asarray(np.linspace(first, second, n + 1))
 
@@ -324,11 +372,12 @@ branch."""
 
 @dataclass(frozen=True)
 class AffineSubspace:
-    """The extended poses among which a path is searched: origin + directions @ y.
+    """The extended poses among which a path is searched: origin + directions @ y with bounded y.
 
     Attributes:
-        origin: (6 + m,) extended pose.
-        directions: (6 + m, d) basis, scaled such that Euclidean distances of y equal `distance`.
+        origin: (6 + m,) extended pose [m, rad; rad or m].
+        directions: (6 + m, d) basis, scaled such that the Euclidean distance between two y equals
+            `distance` between their extended poses.
         lower, upper: (d,) bounds of y [m].
         range: longest motion by which the planner's trees grow [m].
     """
@@ -340,11 +389,11 @@ class AffineSubspace:
     range: float
 
     def extended(self, y: Array) -> Array:
-        """Compute the extended pose (6 + m,) of coordinates (d,)."""
+        """Compute the extended pose (6 + m,) at coordinates y (d,) of the subspace [m]."""
         return np.asarray(self.origin + self.directions @ y)
 
     def coordinates(self, extended: Array) -> Array:
-        """Compute the coordinates (d,) of an extended pose."""
+        """Compute the coordinates (d,) [m] of an extended pose (6 + m,) in the subspace."""
         return np.asarray(np.linalg.pinv(self.directions) @ (extended - self.origin))
 
 
@@ -353,12 +402,12 @@ class Corridor:
     """Limits on the deviation of a path from the straight motion.
 
     Attributes:
-        tilt: largest rotation of the box away from the rotation between start and goal [rad]; 0
-            allows none.
+        tilt: largest rotation of the box away from the straight interpolation between the angles of
+            start and goal [rad]; 0 allows none.
         range: longest motion by which the planner's trees grow [m].
-        aside: largest distance of the box beyond start and goal along each of the world's axes [m].
-        towards: (3,) the only axis, with sign, along which the box may deviate; None for all axes
-            in both directions.
+        aside: largest distance of the box beyond start and goal along each axis of the world [m].
+        towards: -1, 0 or 1 for each axis of the world: the direction in which the box may leave the
+            range between start and goal; None for all directions.
     """
 
     tilt: float
@@ -368,10 +417,10 @@ class Corridor:
 
 
 def search_subspace(start: Array, goal: Array, stray: Corridor, limits: Array) -> AffineSubspace:
-    """Compute the subspace within which a path from start to goal is searched.
+    """Compute the set of extended poses within which a path from start to goal is searched.
 
     Args:
-        start, goal: (6 + m,) extended poses.
+        start, goal: (6 + m,) extended poses [m, rad; rad or m].
         stray: allowed deviation from the straight motion; redundant joints may deviate
             `REDUNDANT_ASIDE` times as far.
         limits: (m, 2) limits of the redundant joints [rad or m].
@@ -414,8 +463,13 @@ beginning with the end itself."""
 
 
 def retreats(chain: ClosedChain, ends: tuple[ChainConfiguration, ChainConfiguration]) -> Retreats:
-    """Find straight free motions out of start and goal along the world's axes and between them, for
-    instance out of a shelf."""
+    """Find straight collision-free motions of the box out of its start and its goal, for instance
+    out of a shelf. Directions are the world's axes and the diagonals between them.
+
+    Args:
+        chain: both arms with a fixed hold each.
+        ends: configurations at the start and at the goal.
+    """
     ways = DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1)[:, None]
     begins = [place for place in ends for _ in ways]
     away = np.array([place.extended for place in begins])
@@ -429,8 +483,17 @@ def retreats(chain: ClosedChain, ends: tuple[ChainConfiguration, ChainConfigurat
 def straight_paths(
     chain: ClosedChain, out: Retreats, box: PayloadSceneChecker
 ) -> Iterator[list[ChainConfiguration]]:
-    """Yield the corners of free paths that consist of a retreat, a straight motion, and the reverse
-    of a retreat in the same direction; the shortest first, one per direction."""
+    """Yield collision-free paths of three straight motions: a retreat from the start, a motion
+    across, and the reverse of a retreat from the goal. Shorter paths come first.
+
+    Each path is given by its four corners. The two retreats have the same direction, or two
+    different axes of the world; each such pair of directions gives at most one path.
+
+    Args:
+        chain: both arms with a fixed hold each.
+        out: retreats from start and goal.
+        box: collision checker of the box alone.
+    """
     ways: dict[tuple[bytes, bytes], tuple[float, tuple[int, int], list[ChainConfiguration]]] = {}
     axes = np.flatnonzero(np.count_nonzero(DIRECTIONS, axis=1) == 1)
     same_way = [(k, k) for k in range(len(DIRECTIONS))]
@@ -464,11 +527,12 @@ def plan(
     out_of_time: Callable[[], bool],
     seed: int,
 ) -> list[ChainConfiguration] | None:
-    """Find the corners of a free path from start to goal by RRT-Connect; None if there is none.
+    """Find the corners of a collision-free path from start to goal by the planner RRT-Connect; None
+    if no path is found.
 
     Args:
-        chain: both arms with one pair of holds.
-        out: configurations that straight motions out of start and goal reach.
+        chain: both arms with a fixed hold each.
+        out: retreats from start and goal, whose ends are further roots of the planner's trees.
         room: extended poses that the path may use.
         most: largest number of configurations that may be checked.
         out_of_time: function that returns True if no time is left.
@@ -488,8 +552,8 @@ def plan(
             states.append(state)
 
     def joined(first: State, second: State) -> bool:
-        """Return True if the straight motion between two states is free. One of the states was
-        reached before."""
+        """Return True if the straight motion between two states (d,) is free of collisions. At
+        least one of the states has been reached before."""
         if first not in places:
             first, second = second, first
         if first not in places:
@@ -515,7 +579,13 @@ def plan(
 def _usable(
     stops: list[ChainConfiguration], place: ChainConfiguration, room: AffineSubspace
 ) -> list[ChainConfiguration]:
-    """Return the configurations that are away from an end and within the room."""
+    """Select the configurations that are in a region and at least `SHORT_RETREAT` from an end.
+
+    Args:
+        stops: the configurations.
+        place: configuration at the end, the start or the goal.
+        room: the region.
+    """
     at = [room.coordinates(stop.extended) for stop in stops]
     return [
         stop
@@ -526,7 +596,8 @@ def _usable(
 
 
 def same(first: ChainConfiguration, second: ChainConfiguration) -> bool:
-    """Return True if both arms have the same branches and turns in two configurations."""
+    """Return True if the joint positions of both arms agree within `MATCH` in two
+    configurations."""
     apart = [np.abs(a - b).max() for a, b in zip(first.q, second.q, strict=True)]
     return bool(max(apart) < MATCH)
 
@@ -543,13 +614,14 @@ def connected(
     ended: Callable[[], bool],
     seed: int,
 ) -> list[State] | None:
-    """Find the states of a path by RRT-Connect; None if there is none.
+    """Find the corners of a path between two sets of states by the planner RRT-Connect; None if no
+    path is found.
 
     Args:
-        bounds: least and largest states (d,).
-        longest: longest motion by which the planner's trees grow.
+        bounds: least and largest value (d,) of each coordinate of a state.
+        longest: longest motion by which the planner's trees grow, in the unit of the states.
         joined: function that returns True if the straight motion between two states is free.
-        ends: possible first states, and possible last states.
+        ends: states (d,) at which the path may begin, and states at which it may end.
         ended: function that returns True if the search has to end.
         seed: seed of the planner, at least 1.
 
@@ -571,7 +643,7 @@ def connected(
         return tuple(state[k] for k in range(size))
 
     class Validator(base.MotionValidator):  # type: ignore[misc]
-        """Validator that reports whether a motion is free."""
+        """OMPL's validator of motions; it asks `joined`."""
 
         def checkMotion(self, first: Any, second: Any) -> bool:
             return joined(values(first), values(second))
