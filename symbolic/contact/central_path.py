@@ -66,54 +66,57 @@ AnyExpression = TypeVar("AnyExpression", ca.SX, ca.MX)
 
 
 class ConvexProgram(Protocol):
-    """A load that a set of contacts has to balance, and the cost of their wrenches.
+    """Convex program: the contact wrenches of least cost that balance a load.
 
-    Wrenches are scaled as in `symbolic.contact.force_closure`. The argument `cell` of the methods
-    is the list of inputs in the order of `cell_sizes`.
+    Each contact's wrench is scaled to N, T / mu, M / (mu r) as in `symbolic.contact.force_closure`.
+    The argument `cell` of every method lists the program's inputs in the order of `cell_sizes`.
     """
 
     @property
     def patches(self) -> tuple[Patch, ...]:
-        """Patches of all contacts."""
+        """Contact patches, one per contact, in the order of the wrenches."""
 
     @property
     def cell_sizes(self) -> tuple[tuple[str, int], ...]:
-        """Names and sizes of the program's inputs."""
+        """Name and number of entries of each input of the program."""
 
     @property
     def given(self) -> dict[str, ca.SX]:
-        """Symbolic parameters of the cell in the program's formulas, by name of their group.
-        Compiled functions take them after the inputs `cell_sizes`."""
+        """Symbolic parameters of the cell in the program's formulas, by name of the parameter
+        group. Compiled functions take these parameters after the inputs `cell_sizes`."""
 
     def free(self, wrenches: list[ca.SX]) -> ca.SX:
-        """Select the free components from all wrenches; the load determines the other
-        components."""
+        """Select the free components from the scaled wrenches of all contacts, as one column. The
+        load and the free components determine the other components."""
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
-        """Compute all wrenches from the free components, affinely. The load determines the other
-        six components."""
+        """Compute the scaled wrenches of all contacts that balance the load in `cell`. The result
+        is affine in the free components `free`."""
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
-        """Compute the minimised cost: a sum over the contacts of convex terms that are at most
-        quadratic."""
+        """Compute the cost of scaled wrenches, a scalar: the sum over the contacts of convex terms
+        of degree two at most."""
 
     def start(self, cell: list[ca.SX]) -> tuple[list[ca.SX], ca.SX]:
-        """Return a start that balances the load: states of all patches well within their cones, and
-        the weight over the effort per degree."""
+        """Return the start of the method for the inputs `cell`: the state of each patch, within its
+        cone and in balance with the load; and the barriers' weight times the sum of the patches'
+        degrees, over the effort."""
 
     def __hash__(self) -> int:
         """Hash by identity: compiled functions are cached by program."""
 
 
 class Patch(ABC):
-    """A kind of contact patch, with the barrier of its cone.
+    """Kind of contact patch, with a barrier function of its friction cone.
+
+    X is the state and S its multipliers; on the central path X S equals the barrier's weight.
 
     Attributes:
-        wrench_size: entries of a scaled wrench: six, or those that the patch can bear.
-        state_size: entries of a state.
-        iterate_size: entries of an iterate: the state, further entries of X, and multipliers.
-        correction_size: entries of a second-order correction.
-        degree: trace of X S over the weight on the central path.
+        wrench_size: number of entries of a scaled wrench: six, or fewer if the patch bears fewer.
+        state_size: number n of entries of a state; the scaled wrench comes first.
+        iterate_size: number of entries of an iterate: state, further entries of X, multipliers.
+        correction_size: number of entries of a second-order correction.
+        degree: trace of X S over the weight, on the central path.
     """
 
     wrench_size: ClassVar[int]
@@ -124,25 +127,29 @@ class Patch(ABC):
 
     @abstractmethod
     def centred(self, state: ca.SX, weight: ca.SX) -> ca.SX:
-        """Return the iterate with this state and with multipliers such that X S equals the
-        weight."""
+        """Return the iterate (iterate_size,) of a state (n,), with the multipliers for which X S
+        equals the barrier's weight `weight`."""
 
     @abstractmethod
     def local(self, iterate: ca.SX) -> LocalPatch:
-        """Compute the derivatives of the barrier at an iterate that are needed for a step."""
+        """Compute the derivatives of the barrier that a Newton step from an iterate (iterate_size,)
+        needs."""
 
     @abstractmethod
     def potential(self, state: ca.SX) -> ca.SX:
-        """Compute the barrier at a state. Its gradient gives the multipliers of `centred`."""
+        """Compute the value of the barrier at a state (n,). Minus its gradient times the weight
+        gives the multipliers of `centred`."""
 
     @abstractmethod
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
-        """Return a lower bound of the least relative change of the eigenvalues of X if the state
-        changes."""
+        """Compute a negative number -1 / t, where t is a step length for which `state` + t `change`
+        (n,) still lies within the cone. It bounds the relative changes of the eigenvalues of X from
+        below."""
 
     @abstractmethod
     def slack(self, state: ca.SX) -> ca.SX:
-        """Compute the slack of a state: positive inside the cone, zero or negative outside."""
+        """Compute a scalar that is positive if a state (n,) lies inside the cone, and zero or
+        negative outside."""
 
     def barrier(self, state: ca.SX) -> tuple[ca.SX, ca.SX]:
         """Compute the barrier's gradient (n,) and Hessian (n, n) at a state."""
@@ -152,8 +159,8 @@ class Patch(ABC):
         return found[0], found[1]
 
     def third(self, state: ca.SX, along: ca.SX, columns: ca.SX) -> ca.SX:
-        """Compute the third derivative (n, k) of the barrier at a state, along a direction (n,) and
-        along each of k columns (n, k)."""
+        """Compute the third derivative (n, k) of the barrier at a state (n,): the change of its
+        Hessian along the direction `along` (n,), times `columns` (n, k)."""
         sizes = (1, 1, columns.shape[1])
         symbol, one, others = symbols = [ca.SX.sym("s", self.state_size, k) for k in sizes]
         slope = ca.gradient(self.potential(symbol), symbol)
@@ -163,15 +170,15 @@ class Patch(ABC):
 
 @dataclass(frozen=True)
 class NewtonStep:
-    """A step of X and its multipliers.
+    """Newton step of one patch: changes of its state and its multipliers.
 
     Attributes:
-        change: (iterate_size,) change of the iterate.
-        lowest_of_state: lower bound of the least relative change of the eigenvalues of X.
-        lowest: the same bound for X and S.
-        second_order: function that returns the correction (correction_size,) of a full step,
+        change: (iterate_size,) change of the iterate in a full step.
+        lowest_of_state: -1 / t for a step length t within the cone of the state (`Patch.lowest`).
+        lowest: -1 / t for a step length t within the cones of state and multipliers.
+        second_order: returns the second-order correction (correction_size,) of a full step,
             sym(X^-1 dX dS).
-        gap_after: function of the step's length that returns the trace of X S after it.
+        gap_after: maps a step length to the trace of X S after the step.
     """
 
     change: ca.SX
@@ -182,10 +189,10 @@ class NewtonStep:
 
 
 class LocalPatch(Protocol):
-    """Derivatives of a patch at an iterate.
+    """Derivatives of one patch's barrier at an iterate.
 
     Attributes:
-        state: (n,) entries of X, the wrench first.
+        state: (n,) state, the scaled wrench first.
         stiffness: (n, n) decrease of the multipliers per change of the state.
         gap: trace of X S.
     """
@@ -195,24 +202,24 @@ class LocalPatch(Protocol):
     gap: ca.SX
 
     def pull(self, weight: ca.SX, correction: ca.SX) -> ca.SX:
-        """Compute the multipliers (n,) for a weight and a second-order correction at an unchanged
-        state."""
+        """Compute the multipliers (n,) after a Newton step to a weight of the barrier that leaves
+        the state unchanged, with a second-order correction (correction_size,)."""
 
     def step(self, weight: ca.SX, correction: ca.SX, change: ca.SX) -> NewtonStep:
-        """Return the step with a change (n,) of the state and the multipliers for a weight and a
-        correction."""
+        """Compute the Newton step to a weight of the barrier with a second-order correction
+        (correction_size,), from the change (n,) of the state in this step."""
 
 
 # --- the method ---
 
 
 def least_effort(program: ConvexProgram, *cell: ca.MX, differentiable: bool = False) -> ca.MX:
-    """Build the expression of the scaled wrenches of least effort, one after the other in the order
-    of the program's patches.
+    """Build the expression of the wrenches of least effort, one column with the scaled wrenches of
+    all patches.
 
     Args:
-        cell: the program's inputs, followed by its symbolic parameters.
-        program: the program.
+        program: the convex program.
+        cell: the program's inputs, then its symbolic parameters.
         differentiable: True for exact first derivatives. Further steps then move the wrenches onto
             the central path, and only the last step is differentiated. Second derivatives are
             wrong.
@@ -227,8 +234,11 @@ def least_effort(program: ConvexProgram, *cell: ca.MX, differentiable: bool = Fa
 
 @lru_cache(PROGRAMS)
 def central_path(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
-    """Build the function from the program's inputs to an iterate of all patches near the central
-    path at the final weight."""
+    """Build the function that solves a program by the interior-point method.
+
+    The program's inputs and symbolic parameters map to the iterates of all patches, one after the
+    other. They lie near the central path at a weight of `final_weight` times the effort.
+    """
     cell = _mx_inputs(program)
     step = _step(program, final_weight)
     iterate = _repeated(program, step, CENTRAL_PATH_STEPS, _start(program)(*cell), cell)
@@ -237,8 +247,11 @@ def central_path(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> 
 
 @lru_cache(PROGRAMS)
 def centred(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
-    """Build the function from the program's inputs to states of all patches on the central path.
-    Its derivatives are zero."""
+    """Build the function that solves a program and moves the solution onto the central path.
+
+    The program's inputs and symbolic parameters map to the states of all patches, one after the
+    other, at a weight of `final_weight` times the effort. CasADi takes its derivatives as zero.
+    """
     cell = _mx_inputs(program)
     owns = ca.vertsplit(central_path(program, final_weight)(*cell), ends_of(program))
     near = [own[: patch.state_size] for patch, own in zip(program.patches, owns, strict=True)]
@@ -305,10 +318,11 @@ def _step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Func
 
 @lru_cache(PROGRAMS)
 def barrier_step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
-    """Build a Newton step on the barriers alone, from states to states of the final weight.
+    """Build the function of one Newton step of all patches' states towards the central path.
 
-    On the central path, its derivatives by the inputs are the derivatives of the path. Like `_step`
-    it takes an unused flag and returns a flag that asks for more.
+    Inputs: states, an unused flag, the program's inputs and symbolic parameters. Outputs: new
+    states, and a flag that is 1 if a further step is needed. On the central path, the derivatives
+    by the inputs are those of the path. The weight is `final_weight` times the effort.
     """
     states, cell = ca.SX.sym("states", state_ends(program)[-1]), _sx_inputs(program)
     owns = ca.vertsplit(states, state_ends(program))
@@ -325,8 +339,12 @@ def barrier_step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> 
 def barrier_equations(
     program: ConvexProgram, states: list[ca.SX], cell: list[ca.SX], final_weight: float
 ) -> tuple[ca.SX, list[ca.SX], Equations]:
-    """Return the weight, the barriers' multipliers at this weight, and Newton's equations of effort
-    and barriers."""
+    """Build Newton's equations of the effort plus the barriers, at one state per patch.
+
+    Returns:
+        The weight, `final_weight` times the effort; for each patch the multipliers, -weight times
+        the barrier's gradient; and Newton's equations.
+    """
     weight = final_weight * program.effort(wrenches_of(program, states), cell)
     patches = zip(program.patches, states, strict=True)
     slopes, curvatures = zip(*[patch.barrier(own) for patch, own in patches], strict=True)
@@ -337,14 +355,16 @@ def barrier_equations(
 def central_point(
     program: ConvexProgram, states: Array, cell: list[Array], share: float
 ) -> tuple[Array, Array]:
-    """Compute states (n,) of all patches on the central path, and their derivatives (n, m) by the
-    program's first input (m,).
+    """Compute the point of the central path for given inputs, with NumPy.
 
     Args:
-        program: the program.
-        states: (n,) initial states within the cones that balance the load.
-        cell: the program's inputs.
-        share: weight over the effort per degree.
+        program: the convex program.
+        states: (n,) initial states of all patches, within the cones and in balance with the load.
+        cell: values of the program's inputs; the first is the load (m,).
+        share: weight of the barriers, times the sum of the patches' degrees, over the effort.
+
+    Returns:
+        States (n,) of all patches on the central path, and their derivatives (n, m) by the load.
     """
     final_weight = share / degree_of(program)
     step = barrier_step(program, final_weight)
@@ -382,7 +402,7 @@ def _start(program: ConvexProgram) -> ca.Function:
 
 
 def minimum(values: list[ca.SX]) -> ca.SX:
-    """Return the expression of the least of several values."""
+    """Return the expression of the smallest of several scalar values."""
     found = values[0]
     for value in values[1:]:
         found = ca.fmin(found, value)
@@ -390,23 +410,24 @@ def minimum(values: list[ca.SX]) -> ca.SX:
 
 
 def symmetric(rows: Sequence[Sequence[ca.SX]]) -> ca.SX:
-    """Build a symmetric matrix (n, n) from the rows of its lower triangle."""
+    """Build a symmetric matrix (n, n) from the n rows of its lower triangle; row i has i + 1
+    entries."""
     n = range(len(rows))
     columns = [ca.vertcat(*[rows[max(i, j)][min(i, j)] for i in n]) for j in n]
     return ca.horzcat(ca.SX(len(rows), 0), *columns)
 
 
 class Factors:
-    """Factors L D L' of the first k unknowns of a symmetric matrix, by default of all. Structural
-    zeros are skipped.
+    """Factorisation L D L' of a symmetric matrix (n, n), of its first k unknowns or of all.
+    Structural zeros are skipped.
 
     Attributes:
-        schur_complement: (n - k, n - k) matrix of the other unknowns after elimination of the first
-            k.
+        schur_complement: (n - k, n - k) matrix of the other unknowns after the elimination.
     """
 
     def __init__(self, matrix: ca.SX, k: int | None = None) -> None:
-        """Factor the lower triangle of `matrix`."""
+        """Factor the first `k` unknowns of `matrix` (n, n), read from its lower triangle; None for
+        all n."""
         n = range(matrix.shape[0])
         rows = [[matrix[i, j] for j in range(i + 1)] for i in n]
         self._below: list[dict[int, ca.SX]] = []  # the columns of L, without zeros
@@ -423,7 +444,8 @@ class Factors:
         self.schur_complement = symmetric([rows[i][rest.start :] for i in rest])
 
     def forward(self, right: ca.SX) -> ca.SX:
-        """Eliminate the first k unknowns from a right side (n,)."""
+        """Eliminate the first k unknowns from a right side `right` (n,); return the reduced right
+        side (n,)."""
         found = ca.vertsplit(right)
         for p, below in enumerate(self._below):
             for i, share in below.items():
@@ -431,7 +453,8 @@ class Factors:
         return ca.vertcat(*found)
 
     def backward(self, reduced: ca.SX, others: ca.SX | None = None) -> ca.SX:
-        """Compute all unknowns (n,) from the result of `forward` and the n - k other unknowns."""
+        """Compute all unknowns (n,) from the reduced right side (n,) of `forward` and from the n -
+        k other unknowns; None if k = n."""
         first = ca.vertsplit(reduced)[: len(self._below)]
         found = [value * over for value, over in zip(first, self._over_pivot, strict=True)]
         found += [] if others is None else ca.vertsplit(others)
@@ -442,15 +465,15 @@ class Factors:
 
 
 class Equations:
-    """Newton's equations of a program at given states.
+    """Newton's equations of a convex program at given states of all patches, n entries together.
 
-    Entries of the states that are not wrenches are eliminated first, patch by patch. Then the
-    equations are solved for the free components of the wrenches.
+    Entries of a state that are not part of the wrench are eliminated first, patch by patch. Then
+    the equations are solved for the free components of the wrenches.
 
     Attributes:
-        effort: effort at the states.
-        missing: (n,) change of the states that balances the load.
-        slope, curvature: (n,) and (n, n) first and second derivatives of the effort by the states.
+        effort: effort at the states, a scalar.
+        missing: (n,) change of the dependent components that balances the load.
+        slope, curvature: gradient (n,) and Hessian (n, n) of the effort by the states.
     """
 
     def __init__(
@@ -459,10 +482,10 @@ class Equations:
         """Factor the equations.
 
         Args:
-            program: the program.
+            program: the convex program.
             cell: the program's inputs.
-            states: (m,) state of each patch.
-            stiffness: (m, m) stiffness of each patch.
+            states: state (m,) of each patch.
+            stiffness: for each patch the matrix (m, m), weight times the Hessian of its barrier.
         """
         self._ends = [0, *accumulate(state.shape[0] for state in states)]
         starts = zip(self._ends, program.patches, strict=False)
@@ -482,25 +505,27 @@ class Equations:
         )
 
     def decrement(self, pulls: list[ca.SX], changes: list[ca.SX]) -> ca.SX:
-        """Compute the squared Newton decrement times the weight, from the patches' multipliers and
-        the changes of their states."""
+        """Compute the squared Newton decrement times the weight of the barriers, from the
+        multipliers and the state's change of each patch, (m,) each."""
         return ca.dot(ca.vertcat(*pulls) - self.slope, ca.vertcat(*changes))
 
     def changes(self, pulls: list[ca.SX]) -> list[ca.SX]:
-        """Compute the changes (m,) of each patch's state that follow from its multipliers (m,)."""
+        """Compute the change (m,) of each patch's state in a Newton step from the patches'
+        multipliers `pulls`, (m,) each. The new states balance the load."""
         pull = ca.vertcat(*pulls) - self.slope - ca.mtimes(self._stiff, self.missing)
         found: list[ca.SX] = ca.vertsplit(self.missing + self.balanced_change(pull), self._ends)
         return found
 
     def constrained(self, moved: ca.SX) -> ca.SX:
-        """Compute changes (n, k) of the states from given changes (n, k) of the dependent
-        components. The free components minimise effort and barriers."""
+        """Compute the changes (n, k) of all states that follow from changes `moved` (n, k) of the
+        dependent components. The free components follow so that effort plus barriers stay
+        minimal."""
         pulls = ca.horzsplit(-ca.mtimes(self._stiff, moved))
         return moved + ca.horzcat(*map(self.balanced_change, pulls))
 
     def balanced_change(self, pull: ca.SX) -> ca.SX:
-        """Compute the change (n,) of the states for multipliers (n,) that keeps the load
-        balanced."""
+        """Compute the change (n,) of the states for a right side `pull` (n,) of Newton's equations.
+        The change adds no load."""
         reduced, found = self._first.forward(pull[self._order]), ca.SX(*pull.shape)
         left = self._last.forward(ca.mtimes(self._by_free.T, reduced[-len(self._wrench) :]))
         wrenches = ca.mtimes(self._by_free, self._last.backward(left))
@@ -511,7 +536,8 @@ class Equations:
 def effort_derivatives(
     program: ConvexProgram, states: list[ca.SX], cell: list[ca.SX]
 ) -> list[ca.SX]:
-    """Compute the effort at states, and its gradient (n,) and Hessian (n, n)."""
+    """Compute the effort (scalar) at given states of the patches, its gradient (n,) and its Hessian
+    (n, n) by the n entries of all states."""
     symbols = [ca.SX.sym("state", state.shape[0]) for state in states]
     effort, whole = program.effort(wrenches_of(program, symbols), cell), ca.vertcat(*symbols)
     by = [effort, *ca.hessian(effort, whole)[::-1]]
@@ -531,21 +557,23 @@ def _sx_inputs(program: ConvexProgram) -> list[ca.SX]:
 
 
 def wrenches_of(program: ConvexProgram, owns: list[AnyExpression]) -> list[AnyExpression]:
-    """Select the wrench at the beginning of each patch's state or iterate."""
+    """Select the scaled wrench (wrench_size,) of each patch: the first entries of its state or
+    iterate in `owns`."""
     return [own[: patch.wrench_size] for patch, own in zip(program.patches, owns, strict=True)]
 
 
 def degree_of(program: ConvexProgram) -> float:
-    """Sum the patches' degrees."""
+    """Return the sum of the degrees of a program's patches."""
     return sum(patch.degree for patch in program.patches)
 
 
 def ends_of(program: ConvexProgram) -> list[int]:
-    """Return the index of the first entry of each patch in an iterate, then the iterate's size."""
+    """Return the index at which each patch begins in the vector of all iterates, then the vector's
+    size."""
     return [0, *accumulate(patch.iterate_size for patch in program.patches)]
 
 
 def state_ends(program: ConvexProgram) -> list[int]:
-    """Return the index of the first entry of each patch in the states of all patches, then their
+    """Return the index at which each patch begins in the vector of all states, then the vector's
     size."""
     return [0, *accumulate(patch.state_size for patch in program.patches)]

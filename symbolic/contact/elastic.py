@@ -25,10 +25,11 @@ from symbolic.records import Contact, Workcell
 
 
 def layer_shares(pads: Sequence[Contact]) -> Array:
-    """Compute the matrices (n, 6, 6) that map a load to the wrenches of n pads.
+    """Compute how a load is shared among n pads on elastic layers: one matrix (6, 6) per pad, (n,
+    6, 6).
 
-    The load is force and moment about the box frame's origin, along the box's axes. A wrench acts
-    from the pad on the payload, about the pad's place, along the pad's axes [N, N m].
+    A matrix maps the load, force and moment about the box frame's origin along the box's axes, to
+    the pad's wrench on the payload, about the pad's origin along the pad's axes [N, N m].
     """
     maps, stiff = [wrench_to_box(pad) for pad in pads], [layer_stiffness(pad) for pad in pads]
     whole = sum(A @ K @ A.T for A, K in zip(maps, stiff, strict=True))
@@ -36,13 +37,17 @@ def layer_shares(pads: Sequence[Contact]) -> Array:
 
 
 def pressure_shifts(workcell: Workcell, load: Array, normal: Array) -> Array:
-    """Compute for each robot how far its centres of pressure shift, over the shift at which the
-    pressure at a rim vanishes: (n, 2), the largest of the robot's pads.
+    """Compute how far the centres of pressure shift, relative to the shift at which the pressure at
+    a rim vanishes.
 
     Args:
         workcell: cell whose pads share each robot's normal force in proportion to their areas.
-        load: (n, 6) force and moment about the box frame's origin, along the box's axes [N, N m].
+        load: (n, 6) force and moment about the box frame's origin, along the box's axes [N, N m],
+            at n samples.
         normal: (n, 2) normal forces of the robots [N].
+
+    Returns:
+        (n, 2) largest ratio of each robot's pads; a rim lifts off above 1.
     """
     pads, robots = workcell.pads, workcell.pad_robots
     area = np.array([pad.area for pad in pads])
@@ -60,14 +65,14 @@ def pressure_shifts(workcell: Workcell, load: Array, normal: Array) -> Array:
 
 
 def free_shift(pad: Contact) -> float:
-    """Compute the smallest shift of a pad's centre of pressure at which the pressure at a rim
-    vanishes [m]."""
+    """Compute the smallest shift of a pad's centre of pressure at which the pressure at a point of
+    the rim vanishes [m]."""
     return float(min(kern(pad)))
 
 
 def kern(pad: Contact) -> tuple[Any, Any]:
-    """Compute the shifts [m] along both axes of a pad at which the pressure at a rim vanishes. They
-    are numbers, or symbols if the pad's lengths are."""
+    """Compute the shifts of the centre of pressure along a pad's x and y axes at which the pressure
+    at a point of the rim vanishes [m]. They are symbols if the pad's lengths are symbols."""
     if pad.half_sides is None:
         share = 2.0 if pad.is_ring else 4.0
         return pad.patch_radius / share, pad.patch_radius / share
@@ -75,8 +80,12 @@ def kern(pad: Contact) -> tuple[Any, Any]:
 
 
 def layer_stiffness(pad: Contact) -> Array:
-    """Compute the stiffness (6, 6) of a pad's layer along the pad's axes, over its normal stiffness
-    per area."""
+    """Compute the stiffness (6, 6) of a pad's elastic layer about the pad's origin, along the pad's
+    axes.
+
+    The unit is the normal stiffness per area of a layer with `layer_stiffness` 1, so translations
+    have entries in m^2 and rotations in m^4.
+    """
     area = pad.area
     # Means of the squared coordinates: the side, or the radius of a ring or a disc, times the kern.
     if pad.half_sides is None:

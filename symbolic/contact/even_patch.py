@@ -49,10 +49,10 @@ slowly."""
 
 @dataclass(frozen=True)
 class EvenPatch(Patch):
-    """A patch with uniform pressure.
+    """Contact patch under uniform pressure, with the state N, T / mu (2,), M / (mu r) of a pad.
 
     Attributes:
-        shape: lengths of the patch over its radius, in the pad's axes.
+        shape: lengths of the patch over its radius, along the pad's axes.
     """
 
     shape: SoftPatch
@@ -60,22 +60,23 @@ class EvenPatch(Patch):
     iterate_size, degree = 2 * len(EVEN) + 1, DEGREE
 
     def centred(self, state: ca.SX, weight: ca.SX) -> ca.SX:
-        """Return the iterate with this state and the multipliers -weight times the barrier's
-        gradient."""
+        """Return the iterate (9,): the state (4,), the multipliers (4,), which are -weight times
+        the barrier's gradient, and the weight."""
         return ca.vertcat(state, -weight * self.barrier(state)[0], weight)
 
     def local(self, iterate: ca.SX) -> LocalEven:
-        """Return the barrier's derivatives at an iterate."""
+        """Return the barrier's derivatives at an iterate (9,)."""
         return LocalEven(self, iterate)
 
     def potential(self, state: ca.SX) -> ca.SX:
-        """Compute the barrier -log(f^2 - M^2) at a state."""
+        """Compute the barrier -log(f^2 - M^2) at a state (4,), with the largest torsion f and the
+        torsion M of the state."""
         grip = ca.sqrt(self._grip_squared(state))
         return -ca.log(torsion_capacity(grip, state[1:3], self.shape)[0] ** 2 - state[3] ** 2)
 
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
-        """Return -1 / t for a length t of the change that stays within the cone. t is nearly the
-        longest such length."""
+        """Compute -1 / t for a length t such that `state` + t `change`, both (4,), stays within the
+        cone. t is nearly the longest such length."""
         # The friction limit: the lower eigenvalue of (N, T).
         square = self._grip_squared(state)
         mean = (state[0] * change[0] - ca.dot(state[1:3], change[1:3])) / square
@@ -91,8 +92,9 @@ class EvenPatch(Patch):
         return -1.0 / ca.fmax(near, LEAST_LENGTH)
 
     def slack(self, state: ca.SX) -> ca.SX:
-        """Compute the remaining torsion of a state, or the missing friction as a negative
-        number."""
+        """Compute the margin of a state (4,), scaled like the state: the torsion that the patch
+        could bear in addition, or minus the missing friction if the tangential force alone makes
+        the patch slide."""
         grip = ca.sqrt(ca.fmax(self._grip_squared(state), 0.0))
         torsion = torsion_capacity(grip, state[1:3], self.shape)[0] - ca.fabs(state[3])
         friction = state[0] - ca.sqrt(ca.sumsqr(state[1:3]))
@@ -104,19 +106,20 @@ class EvenPatch(Patch):
 
 
 class LocalEven:
-    """Derivatives of an `EvenPatch` at an iterate.
+    """Derivatives of an `EvenPatch`'s barrier at an iterate.
 
     Attributes:
-        slope, curvature: (4,) and (4, 4) first and second derivatives of the barrier.
-        stored, weight: weight of the iterate, and the weight that steps use.
-        trust: share of the way to the boundary that a step may aim at.
+        slope, curvature: gradient (4,) and Hessian (4, 4) of the barrier by the state.
+        stored: weight of the barrier in the iterate.
+        weight: weight that steps use, `stored` or more.
+        trust: share of the way to the cone's boundary that a step may aim at.
     """
 
     def __init__(self, patch: EvenPatch, iterate: ca.SX) -> None:
         """Compute the barrier's derivatives at an iterate, and the weight that steps use.
 
-        This is the weight of the iterate or, if larger, the product of state and multipliers over
-        `DEGREE`.
+        The weight that steps use is the weight of the iterate or, if larger, the scalar product of
+        state and multipliers over `DEGREE`.
 
         Args:
             patch: the patch.
@@ -138,13 +141,22 @@ class LocalEven:
         self.trust = ca.fmin(ca.fmax(near, LEAST_TRUST), 1.0)
 
     def pull(self, weight: ca.SX, correction: ca.SX) -> ca.SX:
-        """Compute the multipliers (4,) for a weight and a second-order correction at an unchanged
-        state."""
+        """Compute the multipliers (4,) after a Newton step that leaves the state unchanged.
+
+        Args:
+            weight: weight of the barrier at which the step aims.
+            correction: (4,) second-order correction.
+        """
         return -weight * self.slope - correction
 
     def step(self, weight: ca.SX, correction: ca.SX, change: ca.SX) -> NewtonStep:
-        """Return the step with a change (4,) of the state and the multipliers for a weight and a
-        correction."""
+        """Compute the Newton step that belongs to a change of the state.
+
+        Args:
+            weight: weight of the barrier at which the step aims.
+            correction: (4,) second-order correction.
+            change: (4,) change of the state.
+        """
         lowest, grown = self.patch.lowest(self.state, change), weight - self.stored
         of_state = lowest / self.trust
         left = self.pull(weight, correction) - ca.mtimes(self.stiffness, change)

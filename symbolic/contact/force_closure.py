@@ -74,12 +74,13 @@ selected before."""
 
 @dataclass(frozen=True)
 class InternalForce:
-    """An internal squeeze of a grasp.
+    """Internal squeeze of a grasp: pad forces within the friction cones whose sum has no load.
 
     Attributes:
-        states: state of each pad, at the nominal friction; the normal forces sum to one.
-        least_share: least share of the friction, not below `LEAST_SQUEEZE_SHARE`, with which an
-            internal squeeze exists.
+        states: for each pad its scaled state N, T / mu (2,), M / (mu r), at the nominal friction;
+            the normal forces N of all pads sum to one.
+        least_share: least share of the nominal friction coefficients with which an internal squeeze
+            exists, at least `LEAST_SQUEEZE_SHARE`.
     """
 
     states: tuple[Array, ...]
@@ -87,11 +88,11 @@ class InternalForce:
 
 
 def closing_squeeze(workcell: Workcell) -> InternalForce | None:
-    """Find an internal squeeze of the grasp; None if it is not closed with the share
-    `SPARE_FRICTION` of the friction.
+    """Find an internal squeeze of a workcell's pads; None if there is none at the share
+    `SPARE_FRICTION` of the friction coefficients.
 
-    The squeeze is found for the geometric mean of the nominal friction and the least friction that
-    closes the grasp.
+    The squeeze is computed for a lower friction: the geometric mean of this share and the least
+    share for which a squeeze exists.
     """
     if _balanced_states(workcell, SPARE_FRICTION) is None:
         return None
@@ -111,13 +112,13 @@ def closing_squeeze(workcell: Workcell) -> InternalForce | None:
 
 
 def has_force_closure(workcell: Workcell) -> bool:
-    """Return True if a workcell's pads can hold the payload under every motion, if they press
+    """Return True if a workcell's pads can hold the payload under every motion, provided they press
     strongly enough."""
     return _balanced_states(workcell, SPARE_FRICTION) is not None
 
 
 def equal_pressure_rows(workcell: Workcell) -> Array:
-    """Return the matrix (k, pads) of the conditions for equal pressure: its product with the pads'
+    """Return the conditions for equal pressure as a matrix (k, pads). Its product with the pads'
     normal forces is zero.
 
     Each row states that two pads of one arm with the same normal press with equal pressure, because
@@ -136,14 +137,16 @@ def equal_pressure_rows(workcell: Workcell) -> Array:
 
 
 def balance_maps(workcell: Workcell, in_units: bool = False) -> list[Array]:
-    """Return for each pad the matrix (6 + k, 4) that maps its state to its contribution to the
-    balance: force and moment about the box frame's origin along the box's axes, then the k rows of
-    `equal_pressure_rows`.
+    """Return one matrix (6 + k, 4) per pad that maps the pad's state to its part in the balance of
+    the load.
+
+    The first six rows are force and moment about the box frame's origin along the box's axes; the
+    other k rows belong to the conditions of `equal_pressure_rows`.
 
     Args:
-        workcell: the workcell.
-        in_units: True for states in newtons and newton metres instead of states scaled by friction
-            and radius.
+        workcell: cell with the pads.
+        in_units: True for states N, T (2,) [N], M [N m]; False for states scaled by friction and
+            patch radius.
     """
     alike, found = equal_pressure_rows(workcell), []
     for i, pad in enumerate(workcell.pads):
@@ -196,8 +199,8 @@ def _weights(columns: Array) -> Array | None:
 
 
 def state_to_box(contact: Contact) -> Array:
-    """Return the matrix (6, 4) from a patch's state to force and moment about the box frame's
-    origin, along the box's axes."""
+    """Return the matrix (6, 4) that maps a pad's scaled state to force [N] and moment [N m] about
+    the box frame's origin, along the box's axes."""
     mu, r = contact.friction, contact.patch_radius
     local = np.zeros((WRENCH_SIZE, WRENCH_SIZE))
     local[[0, 1, 2], [1, 2, 0]] = mu, mu, 1.0
@@ -207,8 +210,8 @@ def state_to_box(contact: Contact) -> Array:
 
 
 def wrench_to_box(contact: Contact) -> Array:
-    """Return the matrix (6, 6) from a wrench about a pad's centre, along the pad's axes, to the
-    wrench about the box frame's origin."""
+    """Return the matrix (6, 6) that maps a wrench about a pad's origin, along the pad's axes, to
+    the wrench about the box frame's origin, along the box's axes."""
     R, p = contact.T_box_pad[:3, :3], contact.T_box_pad[:3, 3]
     return np.block([[R, np.zeros((3, 3))], [skew(p) @ R, R]])
 
@@ -220,8 +223,8 @@ def _with_friction(states: Array, share: float) -> Array:
 
 
 def scaled_patch(contact: Contact) -> SoftPatch:
-    """Return the patch of a contact with lengths over its radius, along its own axes. It is the
-    same for all discs."""
+    """Return the patch of a contact with all lengths divided by the patch radius, along the pad's
+    axes. Discs of all sizes give equal results."""
     if contact.half_sides is None:
         return SoftPatch(2.0 / 3.0, np.eye(2))
     own = SoftPatch.of(contact, contact.T_box_pad[:3, :3])
@@ -244,11 +247,12 @@ def _generators(contact: Contact) -> Array:
 
 
 def dependent_components(workcell: Workcell) -> tuple[int, ...]:
-    """Select the components of the states that the load and the other components determine. They
-    are the first ones that together balance every load, forces before moments.
+    """Select the components of all pads' states that follow from the load and from the other
+    components, as indices into the states one after the other.
 
-    The choice depends on neither friction nor sizes, and it is stable under small displacements of
-    pads. Pivots of nearly equal size would not be.
+    The choice takes forces before moments, in the order of the pads, until the selected components
+    can balance every load. It depends on neither friction nor sizes, and small displacements of the
+    pads do not change it.
     """
     effects = np.hstack(balance_maps(workcell, in_units=True)).astype(float)
     effects[3:LOAD_SIZE] /= MOMENT_ARM
@@ -275,12 +279,13 @@ def _new_columns(matrix: Array, order: Sequence[int], least: float) -> list[int]
 
 
 def derive_grasp_numbers(workcell: Workcell, reach: float = 1.0) -> GraspNumbers:
-    """Compute the constants of a grasp, except its states at rest.
+    """Compute the constants in the formulas of a grasp, without the states at rest (`rest`,
+    `rest_slopes` are None).
 
     Args:
-        workcell: the workcell.
-        reach: size of the patches within which the squeeze has to lie, over the size of the cell's
-            patches.
+        workcell: cell with the pads.
+        reach: factor on the patch sizes; the internal squeeze lies within patches of this relative
+            size.
 
     Raises:
         SettingsError: no internal squeeze exists.
@@ -314,8 +319,8 @@ def derive_grasp_numbers(workcell: Workcell, reach: float = 1.0) -> GraspNumbers
 
 
 def grasp_shapes(workcell: Workcell) -> dict[str, Any]:
-    """Return the shapes of all arrays of `GraspNumbers`; the entry `shapes` has one shape per
-    pad."""
+    """Return the shape of every array of `GraspNumbers` by the field's name; the entry `shapes`
+    holds one shape per pad."""
     pads = workcell.pads
     b, n = len(dependent_components(workcell)), len(EVEN) * len(pads)
     return {
@@ -342,7 +347,7 @@ def _shape(pad: Contact) -> Array:
 
 
 def least_distance(workcell: Workcell) -> float:
-    """Compute the least distance between two pads of different robots [m]."""
+    """Compute the least distance between the origins of two pads of different robots [m]."""
     places = [
         np.array([pad.T_box_pad[:3, 3] for pad in (contact, *contact.further)])
         for contact in workcell.contacts
@@ -351,7 +356,8 @@ def least_distance(workcell: Workcell) -> float:
 
 
 def smaller_patches(workcell: Workcell, share: float) -> Workcell:
-    """Return the cell with all patches smaller by a factor `share`, at the same places."""
+    """Return the workcell with the size of every contact patch multiplied by `share`, at unchanged
+    places."""
 
     def smaller(contact: Contact) -> Contact:
         sides = contact.half_sides
@@ -367,8 +373,12 @@ def smaller_patches(workcell: Workcell, share: float) -> Workcell:
 
 
 def robot_wrenches(workcell: Workcell) -> Array:
-    """Return the matrix (6, 6 k) from the wrenches of all k pads to the wrench of the first robot:
-    force and moment about its nominal contact point, along the axes of contact 1."""
+    """Return the matrix (6, 6 k) that maps the wrenches of all k pads to the sum of their forces
+    and moments along the axes of contact 1.
+
+    Each pad's moment is taken about the nominal contact point of the pad's own robot. A pad's
+    wrench has the entries N, T (2,), N d (2,), M along the pad's axes.
+    """
     axes, columns = workcell.contacts[0].T_box_pad[:3, :3], []
     for pad, robot in zip(workcell.pads, workcell.pad_robots, strict=True):
         force, moment = np.zeros((2, 3, WRENCH_SIZE))

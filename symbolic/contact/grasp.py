@@ -67,21 +67,25 @@ WHOLE = ca.SX.ones(2)
 
 
 class Grasp:
-    """The pads of one workcell as a convex program. Programs are compared by identity.
+    """Convex program of a workcell's pads, for any number of pads and any normals. Programs are
+    equal only to themselves.
 
     Attributes:
         robots: index of the robot of each pad.
-        patches, cell_sizes, given: patches, inputs and symbolic parameters of the `ConvexProgram`.
+        patches: barrier functions of the pads, as in `ConvexProgram`.
+        cell_sizes: names and sizes of the inputs: load (6,), friction (2,).
+        given: symbolic parameters by name of their group.
         friction: (2,) friction coefficients of the robots' pads.
         numbers: derived constants of the grasp.
     """
 
     def __init__(self, workcell: Workcell, numbers: GraspNumbers | None = None) -> None:
-        """Derive the constants of the grasp, unless `numbers` or the workcell states them.
+        """Take the constants of the grasp, or derive them.
 
         Args:
             workcell: cell with the pads, the payload and the friction coefficients.
-            numbers: constants of the grasp; None to take or derive them from the workcell.
+            numbers: constants of the grasp; None to take them from a workcell with symbolic
+                parameters, or to derive them.
 
         Raises:
             SettingsError: no internal squeeze exists.
@@ -102,16 +106,16 @@ class Grasp:
 
     @property
     def free_size(self) -> int:
-        """Number of free components of the wrenches."""
+        """Number of free components of the wrenches: those that the load does not determine."""
         return len(self._free)
 
     def free(self, wrenches: list[ca.SX]) -> ca.SX:
-        """Select the free components of all wrenches."""
+        """Select the free components (free_size,) from the scaled wrenches (4,) of all pads."""
         return ca.vertcat(*wrenches)[self._free.tolist()]
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
-        """Compute the wrenches of all pads that balance a load, from the free components. The load
-        is the first of the inputs `cell`."""
+        """Compute the scaled wrenches (4,) of all pads that balance the load, the first of the
+        inputs `cell`, from their free components (free_size,)."""
         load, *sizes = cell
         return self._balanced_wrenches(load, free, sizes)
 
@@ -127,18 +131,27 @@ class Grasp:
         return wrenches
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
-        """Compute half the sum of all squared forces."""
+        """Compute half the sum of all squared pad forces, |f_i|^2 / 2, from scaled wrenches (4,)
+        and the inputs `cell`."""
         friction, total = cell[1], 0.0
         for wrench, robot in zip(wrenches, self.robots, strict=True):
             total += wrench[0] ** 2 + friction[robot] ** 2 * ca.sumsqr(wrench[1:3])
         return 0.5 * total
 
     def start(self, cell: list[ca.SX]) -> tuple[list[ca.SX], ca.SX]:
-        """Return states within the cones that balance the load, and their weight.
+        """Compute the start of the interior-point method.
 
         For a load similar to the load at rest, the states are the first-order prediction of the
         central path from its point at rest. Otherwise they are the least-norm states. In both cases
-        squeeze is added until they lie within the cones.
+        internal squeeze is added until the states lie within the cones.
+
+        Args:
+            cell: inputs: scaled load (6,), friction (2,), and relative patch sizes (2,) if the
+                program has this input.
+
+        Returns:
+            State (4,) of each pad, in balance with the load; and the weight of the barriers, times
+            the sum of the patches' degrees, over the effort.
         """
         load, *sizes = cell[: 1 + len(SCALING_INPUTS)]
         given, rest = self.squeeze_states(*sizes), ca.SX(number(self.numbers.load_at_rest))
@@ -176,8 +189,8 @@ class Grasp:
         return ca.SX(number(numbers.rest)), ca.SX(number(numbers.rest_slopes))
 
     def complete(self) -> GraspNumbers:
-        """Return the constants together with the states at rest, for a grasp without symbolic
-        parameters."""
+        """Return the constants together with the states `rest` and derivatives `rest_slopes` of the
+        payload at rest. The grasp must have no symbolic parameters."""
         inputs = [self.numbers.load_at_rest, *map(np.array, self._nominal())]
         load, *sizes = [ca.SX(ca.DM(value)) for value in inputs][: 1 + len(SCALING_INPUTS)]
         asked, given = self.least_states(load, *sizes), self.squeeze_states(*sizes)
@@ -190,13 +203,20 @@ class Grasp:
         return (np.array(ca.evalf(self.friction)).ravel().tolist(),)
 
     def least_states(self, load: ca.SX, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
-        """Compute the least-norm states that balance a load (6,). They may lie outside the
-        cones."""
+        """Compute the states (4,) of all pads that balance a load (6,) with the least norm. They
+        may lie outside the friction cones.
+
+        Args:
+            load: (6,) force and moment about the box frame's origin, along the box's axes.
+            friction: (2,) friction coefficients of the robots' pads.
+            reach: (2,) sizes of the robots' patches over the cell's own sizes.
+        """
         return self._at(ca.mtimes(number(self.numbers.spread), load), friction, reach)
 
     def squeeze_states(self, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
-        """Return the initial squeeze as states for other friction coefficients. It may lie outside
-        the cones if these are far below the nominal ones.
+        """Return the internal squeeze of `numbers` as one state (4,) per pad, scaled by the given
+        friction and patch sizes. The states may lie outside the cones if friction is far below its
+        nominal value.
 
         Args:
             friction: (2,) friction coefficients of the robots' pads.
@@ -205,21 +225,22 @@ class Grasp:
         return self._at(ca.SX(number(self.numbers.squeeze)), friction, reach)
 
     def squeeze_normals(self) -> Array:
-        """Compute the normal forces (2,) of the robots in the initial squeeze of unit size. The
-        grasp must have no symbolic parameters."""
+        """Compute the sum of the normal forces of each robot (2,) in the internal squeeze of unit
+        size. The grasp must have no symbolic parameters."""
         return np.array(ca.evalf(self.normals)).ravel()
 
     @property
     def normals(self) -> ca.SX:
-        """Normal force (2,) of each robot in the squeeze."""
+        """Sum of the normal forces of each robot (2,) in the internal squeeze of unit size, as an
+        expression."""
         squeeze, found = number(self.numbers.squeeze), ca.SX(2, 1)
         for at, robot in zip(self._ends, self.robots, strict=False):
             found[robot] += squeeze[at]
         return found
 
     def squeeze_wrenches(self) -> Array:
-        """Compute the wrenches (k, 6) of all k pads in the initial squeeze of unit size, along the
-        pads' axes. The grasp must have no symbolic parameters."""
+        """Compute the wrenches (k, 6) of all k pads in the internal squeeze of unit size: N, T
+        (2,), N d (2,), M along each pad's axes. The grasp must have no symbolic parameters."""
         states = ca.vertsplit(ca.SX(number(self.numbers.squeeze)), self._ends)
         parts = [
             full_wrench(self.units(i, self.friction) * state) for i, state in enumerate(states)
@@ -229,11 +250,13 @@ class Grasp:
     def solve(
         self, cell: list[ca.MX], given: Sequence[ca.MX], differentiable: bool = False
     ) -> ca.MX:
-        """Build the expression of all pads' wrenches of least effort [N, N m]. They exceed any
-        limit if friction does not close the grasp.
+        """Build the expression of the wrenches of least effort, (6 k,) for k pads: N, T (2,) [N], N
+        d (2,), M [N m] of each pad along its axes. Normal forces exceed any limit if friction does
+        not close the grasp.
 
         Args:
-            cell: the program's inputs, first the load in newtons.
+            cell: the program's inputs; the first is the load (6,) about the box frame's origin,
+                along the box's axes [N, N m].
             given: symbolic parameters of the grasp.
             differentiable: True for exact first derivatives.
         """
@@ -255,21 +278,30 @@ class Grasp:
     def result(
         self, wrenches: list[ca.SX], sizes: list[ca.SX]
     ) -> tuple[ca.SX, ca.SX | ca.DM | float]:
-        """Return the wrenches of all pads in units of the load's scale, and the value that replaces
-        them if friction does not close the grasp.
+        """Convert scaled wrenches to the result of the program, divided by the size of the load.
 
         Args:
-            wrenches: wrenches of all pads, scaled by friction and patch sizes.
-            sizes: the inputs of the function that are listed in `SCALING_INPUTS`: friction
-                coefficients, and the sizes of the patches if they are inputs.
+            wrenches: scaled wrench (4,) of each pad.
+            sizes: inputs named in `SCALING_INPUTS`: friction coefficients (2,), and relative patch
+                sizes (2,) if the program has this input.
+
+        Returns:
+            Wrenches (6 k,) of all k pads; and the values (6 k,) that replace them if friction does
+            not close the grasp.
         """
         whole = [full_wrench(self.units(i, *sizes) * own) for i, own in enumerate(wrenches)]
         beyond = ca.DM([BEYOND, 0, 0, 0, 0, 0])
         return ca.vertcat(*whole), ca.repmat(beyond, len(wrenches), 1)
 
     def units(self, i: int, friction: ca.SX, reach: ca.SX = WHOLE) -> ca.SX:
-        """Return the factors (m,) that convert the entries of pad i's scaled wrench to newtons and
-        newton metres."""
+        """Return the factors (4,) that convert the scaled wrench of pad `i` to newtons and newton
+        metres.
+
+        Args:
+            i: index of the pad.
+            friction: (2,) friction coefficients of the robots' pads.
+            reach: (2,) sizes of the robots' patches over the cell's own sizes.
+        """
         robot = self.robots[i]
         radius = self.numbers.reach * self._pads[i].patch_radius
         mu = friction[robot]
@@ -292,12 +324,14 @@ def grasp_wrenches(
     friction: ca.MX,
     given: Sequence[ca.MX] = (),
 ) -> ca.MX:
-    """Build the expression of the wrenches of least effort, (6,) per pad one after the other, along
-    the pad's axes: N, T (2,) [N], the first moment N d (2,) and M [N m]. Normal forces exceed any
-    limit if friction does not close the grasp.
+    """Build the expression of the pad wrenches of least effort, (6 k,) for k pads one after the
+    other.
+
+    A wrench has the entries N, T (2,) [N], the first moment of the pressure N d (2,) and M [N m],
+    along the pad's axes. Normal forces exceed any limit if friction does not close the grasp.
 
     Args:
-        grasp: the pads.
+        grasp: program of the pads.
         load: (6,) force and moment about the box frame's origin, along the box's axes [N, N m].
         friction: (2,) Coulomb coefficients of the robots' pads.
         given: symbolic parameters of the grasp.
@@ -306,7 +340,8 @@ def grasp_wrenches(
 
 
 def full_wrench(wrench: ca.SX) -> ca.SX:
-    """Return all six entries of the wrench of a pad, from the four that it bears."""
+    """Return all six entries N, T (2,), N d (2,), M of a pad's wrench from the four entries N, T
+    (2,), M that it bears; N d is zero. One column per wrench."""
     whole = ca.SX(WRENCH_SIZE, wrench.shape[1])
     whole[list(EVEN), :] = wrench
     return ca.densify(whole)

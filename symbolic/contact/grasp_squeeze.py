@@ -32,12 +32,12 @@ commanded force slightly above the least."""
 
 
 class GraspSqueeze(Grasp):
-    """Program that minimises the normal force of one robot plus `OTHER_WEIGHT` times that of the
-    other.
+    """Convex program of the least commanded force: it minimises the normal force of the commanded
+    robot plus `OTHER_WEIGHT` times the normal force of the other robot.
 
-    Inputs: load (6,); friction (2,) of each robot's pads; sizes (2,) of each robot's patches over
-    the cell's own; displacements (4,) along the pads' tangents, two numbers for all pads of a robot
-    [m].
+    Inputs: load (6,) about the box frame's origin, along the box's axes; friction (2,) of each
+    robot's pads; size (2,) of each robot's patches over the cell's own; displacement (4,) along the
+    pads' tangents [m], two entries for all pads of one robot.
 
     Attributes:
         workcell: the cell.
@@ -45,7 +45,12 @@ class GraspSqueeze(Grasp):
     """
 
     def __init__(self, workcell: Workcell, commanded: int) -> None:
-        """Find the initial squeeze, within the smallest patches of `REACHES` that close the grasp.
+        """Find the internal squeeze, within the smallest relative patch size of `REACHES` that
+        closes the grasp.
+
+        Args:
+            workcell: cell with the pads.
+            commanded: index of the robot whose force is commanded.
 
         Raises:
             SettingsError: no internal squeeze exists.
@@ -64,8 +69,8 @@ class GraspSqueeze(Grasp):
         return (*super()._nominal(), [1.0, 1.0], [0.0] * 4)
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
-        """Compute all wrenches that balance the load of displaced pads, from their free
-        components."""
+        """Compute the scaled wrenches (4,) of all pads that, at the displaced places, balance the
+        load in `cell`, from their free components."""
         load, friction, reach, displacement = cell
         wrenches = self._balanced_wrenches(load, free, [friction, reach])
         for _ in range(DISPLACED):
@@ -86,16 +91,23 @@ class GraspSqueeze(Grasp):
         return total
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
-        """Compute the normal force of the commanded robot plus `OTHER_WEIGHT` times that of the
-        other."""
+        """Compute the normal force of the commanded robot plus `OTHER_WEIGHT` times the normal
+        force of the other robot, from scaled wrenches (4,)."""
         total = 0.0
         for wrench, robot in zip(wrenches, self.robots, strict=True):
             total += wrench[0] * (1.0 if robot == self.commanded else OTHER_WEIGHT)
         return total
 
     def result(self, wrenches: list[ca.SX], sizes: list[ca.SX]) -> tuple[ca.SX, ca.SX | float]:
-        """Return the normal forces (2,) of the robots over the load's scale, and the value that
-        replaces them if there is no solution."""
+        """Convert scaled wrenches to normal forces, divided by the size of the load.
+
+        Args:
+            wrenches: scaled wrench (4,) of each pad.
+            sizes: friction coefficients (2,) and relative patch sizes (2,); not used.
+
+        Returns:
+            Normal force (2,) of each robot, and the value that replaces it if there is no solution.
+        """
         force = [ca.SX(0.0), ca.SX(0.0)]
         for own, robot in zip(wrenches, self.robots, strict=True):
             force[robot] += own[0]
@@ -112,16 +124,18 @@ def commanded_forces(
     handed: dict[str, ca.MX] | None = None,
     differentiable: bool = False,
 ) -> ca.MX:
-    """Build the expression of the robots' normal forces (2,) [N]: the commanded force, which is
-    convex in the load, and the resulting force of the other robot. Both exceed any limit if
+    """Build the expression of the robots' normal forces (2,) [N]: the least commanded force, which
+    is convex in the load, and the force of the other robot that results. Both exceed any limit if
     friction does not close the grasp.
 
     Args:
-        load: (6,) force and moment about the box frame's origin, along the box's axes.
+        squeeze: program with the commanded robot.
+        load: (6,) force and moment about the box frame's origin, along the box's axes [N, N m].
         friction: (2,) Coulomb coefficients of the robots' pads.
         share: (2,) sizes of the robots' patches over the cell's own sizes.
-        displacement: (4,) displacements of the pads along their tangents [m].
-        handed: symbolic parameters of the squeeze.
+        displacement: (4,) displacements of the first, then of the second robot's pads along their
+            tangents [m].
+        handed: symbolic parameters of the program by group.
         differentiable: True for exact first derivatives.
     """
     handed = handed or {}
@@ -138,15 +152,19 @@ def commanded_slack(
     displacement: ca.SX,
     force: ca.SX,
 ) -> ca.SX:
-    """Build the slack of a commanded force, a sufficient test that the force holds a load.
+    """Build the slack of a commanded force, a scalar that is positive only if the force holds the
+    load. It may be negative although the force suffices.
 
-    The slack is positive if the least-norm states, plus the squeeze that needs this force, lie
-    within all cones.
+    The tested forces are the least-norm states that balance the load, plus as much internal squeeze
+    as the commanded force leaves. The slack is positive if these forces lie within all cones.
 
     Args:
-        squeeze: the program.
-        load, friction, share, displacement: as in `commanded_forces`.
-        force: commanded force [N].
+        squeeze: program with the commanded robot.
+        load: (6,) force and moment about the box frame's origin, along the box's axes [N, N m].
+        friction: (2,) Coulomb coefficients of the robots' pads.
+        share: (2,) sizes of the robots' patches over the cell's own sizes.
+        displacement: (4,) displacements of the robots' pads along their tangents [m].
+        force: commanded normal force [N].
     """
     reach = share / squeeze.numbers.reach
     asked, given = (
@@ -163,11 +181,12 @@ def commanded_slack(
 
 
 def internal_force_gain(squeeze: GraspSqueeze) -> ca.Function:
-    """Build the function of the additional commanded force [N] per newton with which the arms push
-    tangentially against each other at any pad.
+    """Build the function of the additional commanded force, in newtons per newton of tangential
+    force with which the arms push against each other at any pad.
 
-    The push is borne by the friction that the squeeze leaves. Inputs: friction (2,) and sizes of
-    the patches (2,) by robot.
+    The friction that the internal squeeze leaves bears this push. Inputs: friction coefficients
+    (2,) and relative patch sizes (2,) of the robots, then the symbolic parameters. Output: a
+    scalar.
     """
     friction, share = ca.SX.sym("friction", 2), ca.SX.sym("share", 2)
     given = squeeze.squeeze_states(friction, share / squeeze.numbers.reach)
