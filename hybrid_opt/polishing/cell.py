@@ -70,15 +70,17 @@ class PolishFunctions:
     Attributes:
         built: the functions by name, described in `symbolic.smooth`: forces and pressure at
             samples, inverse kinematics of both arms, in drivable cells limits along a driven path,
-            and rows at places of the path. Missing ones are made on first use.
-        closure: function of (arm, order) that returns the function from the box pose to the arm's
-            joints, see `symbolic.smooth.places`.
-        row: function of (constraint, order) that returns the function of the constraint's family,
-            see `symbolic.smooth.places.row_function`.
-        numbers: function of a constraint that returns its parameters.
-        arms: function of a constraint that returns the arms on whose joints its value depends.
+            and constraints at places of the path. Functions for other constraints are added on
+            first use.
+        closure: `closure(arm, order)` returns the function from the box pose to the joint positions
+            of an arm, with first or second derivatives, see `symbolic.smooth.places`.
+        row: `row(constraint, order)` returns the function of a constraint at a place, with first or
+            second derivatives, see `symbolic.smooth.places.row_function`.
+        numbers: `numbers(constraint)` returns the constraint's parameters (n,).
+        arms: `arms(constraint)` returns the indices of the arms on whose joints the constraint
+            depends.
         model: arms and bodies of the cell.
-        separable: pairs of bodies for which `gaps` computes separating-axis gaps.
+        separable: indices of the pairs of two boxes, for which `gaps` computes gaps.
     """
 
     def __init__(self, compiled: CompiledCell, built: Mapping[str, NumericFunction]) -> None:
@@ -110,17 +112,24 @@ class PolishFunctions:
         return constraint.arms(self.model)
 
     def gaps(self, pair: int, pose: Array) -> Array:
-        """Compute the gaps (n, SEPARATING_DIRECTIONS) of a separable pair along all separating
-        directions for box poses (n, 6) [m]."""
+        """Compute the gaps between the two boxes of a pair along all separating directions.
+
+        Args:
+            pair: index of the pair, one of `separable`.
+            pose: (n, 6) box poses [m, rad].
+
+        Returns:
+            (n, SEPARATING_DIRECTIONS) gaps [m].
+        """
         return self.built[GAPS].batch(pose, self._obstacle(pair))["gaps"]
 
 
 def sample_quantities(workcell: Workcell) -> tuple[Quantity, ...]:
     """Return the names of the quantities that the polish of a cell evaluates at samples.
 
-    Drivable carries have none, because their limits apply at the intervals of the timing. For pads
-    whose forces have no closed form, the quantity is the load, from which a convex program computes
-    the forces.
+    For drivable cells there are none, because their limits apply at the intervals of the timing.
+    For pads whose forces have no closed form, the quantity is the load, from which a convex program
+    computes the forces.
     """
     if workcell.task.law.is_drivable:
         return ()
@@ -133,11 +142,11 @@ def sample_quantities(workcell: Workcell) -> tuple[Quantity, ...]:
 def polish_functions(compiled: CompiledCell) -> PolishFunctions:
     """Load the compiled functions for the polish of a workcell, or build them.
 
-    Functions of many samples or places per call are compiled for evaluation in lanes at
-    optimisation level 1; higher levels take three times as long to compile and gain nothing
-    (measured on the rack: every function within 5 %, one slower by 40 %). For the first and the
-    last two samples, only second derivatives are evaluated in lanes. Functions of whole paths
-    multiply sparse matrices and have no form for lanes.
+    Functions of many samples or places per call are compiled for evaluation in lanes (several
+    evaluations by one vector instruction) at optimisation level 1. Higher levels take three times
+    as long to compile and gain nothing (measured on the rack: every function within 5 %, one slower
+    by 40 %). For the first and the last two samples, only second derivatives are evaluated in
+    lanes. Functions of whole paths multiply sparse matrices and have no form for lanes.
 
     Raises:
         DualArmError: the cell's model cannot be built, or its functions cannot be compiled.
@@ -187,12 +196,14 @@ def _held(model: CellModel) -> dict[str, ca.Function]:
 
 
 def _driven_held(model: CellModel) -> dict[str, ca.Function]:
-    """Return the force functions with the timing's barrier weight, so that both agree."""
+    """Return the functions of grasp forces with the barrier weight of the timing's own grasp
+    program, so that polish and timing compute equal forces."""
     return grasp_force_functions(model.workcell, TIMING_BARRIER_WEIGHT)
 
 
 def _names(quantities: tuple[Quantity, ...]) -> set[str]:
-    """Return the names of all functions that `polish_functions` builds for these quantities."""
+    """Return the names of all functions that `polish_functions` builds for quantities at
+    samples."""
     blocks = ("inner", "first", "last", "path")
     return {
         GAPS,
@@ -204,13 +215,15 @@ def _names(quantities: tuple[Quantity, ...]) -> set[str]:
 
 
 class Grid:
-    """Places along a task's path: the samples, and places between them.
+    """Places along a task's path: the task's samples, and equally many places between neighbours.
 
     Attributes:
         per_sample: number of places per interval between samples.
         parameter: (m,) path parameter of all places, in [0, 1].
         sample_parameter: (n,) path parameter of the samples.
-        basis, rate_basis: (m, n_waypoints) matrices: poses = basis
+        basis: (m, n_waypoints) matrix B: the extended poses at the places are B W for extended
+            waypoints W.
+        rate_basis: (m, n_waypoints) like B, for the poses' first derivatives by the path parameter.
     """
 
     def __init__(self, task: Task) -> None:
@@ -222,23 +235,21 @@ class Grid:
         self.basis, self.rate_basis = along.position, along.first
 
     def places(self, width: float) -> int:
-        """Return the number of places in an interval of the path parameter of this width, at least
-        one."""
+        """Convert a width in the path parameter to a number of places, at least one."""
         return max(1, round(width * (len(self.parameter) - 1)))
 
     def samples(self, width: float) -> int:
-        """Return the number of samples in an interval of the path parameter of this width, at least
-        one."""
+        """Convert a width in the path parameter to a number of samples, at least one."""
         return max(1, round(width * (len(self.sample_parameter) - 1)))
 
     def between(self, values: Array) -> Array:
-        """Interpolate values (n, k) at the samples to all places (m, k)."""
+        """Interpolate values (n, k) at the n samples linearly to all m places; return (m, k)."""
         return np.column_stack(
             [np.interp(self.parameter, self.sample_parameter, column) for column in values.T]
         )
 
     def movable(self, place: int) -> bool:
-        """Return True unless the place is one of the two fixed ends of the path."""
+        """Return False for the first and the last place of the path, which are fixed, else True."""
         return 0 < place < len(self.parameter) - 1
 
 
@@ -247,15 +258,18 @@ class SmoothCell:
 
     Attributes:
         evaluator: evaluator of candidates by the full model.
-        functions: compiled functions.
-        workcell, task, grid: of the evaluator.
+        functions: compiled functions of the polish.
+        workcell, task: the evaluator's workcell and its task.
+        grid: places along the task's path.
         clearance: distance that bodies keep beyond the collision tolerance [m].
-        robust: robust forces at samples if these are minimised, None for planned forces.
-        centre, half: (n_var,) scaling of the decision vector to [-1, 1] within its bounds, x =
-            centre + half * xi; half is 1 for a fixed variable.
-        free: rows and columns of the variables among the extended waypoints.
-        blocks: division of the samples among functions.
-        coefficients: (2, branches, 2) of `force_branches`.
+        robust: computes robust forces at samples if these are minimised; None for planned forces.
+        centre, half: (n_var,) middle and half range of each decision variable [m, rad, N]. Scaled
+            variables xi in [-1, 1] follow from x = centre + half * xi; half is 1 for a fixed
+            variable.
+        free: row and column indices of the decision variables among the extended waypoints.
+        blocks: groups of samples that one compiled function evaluates.
+        coefficients: (2, branches, 2) coefficients of the linear functions of both
+            `force_quantities` whose maximum is the normal force of each contact.
         has_pressure_limit: whether the contact model limits the shift of the pressure.
     """
 
@@ -266,7 +280,7 @@ class SmoothCell:
 
         Args:
             evaluator: evaluator of candidates by the full model.
-            functions: compiled functions.
+            functions: compiled functions of the polish.
             clearance: distance that bodies keep beyond the collision tolerance [m].
 
         Raises:
@@ -288,20 +302,26 @@ class SmoothCell:
         self._n_path, self._fixed = self.task.n_path, self.task.fixed_waypoints
 
     def scaled(self, x: Array) -> Array:
-        """Return scaled variables xi of x."""
+        """Scale a decision vector x (n_var,) to variables xi (n_var,), in [-1, 1] within the
+        bounds."""
         return (x - self.centre) / self.half
 
     def unscaled(self, xi: Array) -> Array:
-        """Return the decision vector x of scaled variables xi."""
+        """Return the decision vector x (n_var,) of scaled variables xi (n_var,)."""
         return self.centre + self.half * xi
 
     def step(self, start: Array, end: Array) -> float:
-        """Return the largest change of any scaled variable between two decision vectors."""
+        """Return the largest change of any scaled variable between two decision vectors
+        (n_var,)."""
         return float(np.max(np.abs(end - start) / self.half))
 
     def waypoints(self, x: Array) -> Array:
-        """Return `extended_waypoints`, from stored data and without unwrapping where no angle
-        wraps."""
+        """Return the extended waypoints (n_waypoints, 6 + m) [m, rad] of a decision vector x
+        (n_var,).
+
+        The result equals `extended_waypoints`, but takes less time where no angle jumps by more
+        than pi.
+        """
         points = self._fixed.copy()
         points[self.free] = x[: self._n_path]
         turns = points[1:, 3:POSE_SIZE] - points[:-1, 3:POSE_SIZE]

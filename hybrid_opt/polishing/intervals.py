@@ -40,12 +40,14 @@ GRASP_ROWS = 2
 
 @dataclass(frozen=True)
 class PointInequalities:
-    """The inequalities that apply at each point, mix . quantities <= bound, as arrays over the k
-    inequalities.
+    """The k inequalities mix . quantities <= bound that apply at every point.
+
+    Quantities are the limited ones: those of `driven_layout`, then robust forces or the forces of a
+    grasp's program. The bound is the force limit [N] or 1.
 
     Attributes:
         mix: (k, quantities) coefficients.
-        is_force: (k,) True if the bound is the force limit, else the bound is 1.
+        is_force: (k,) True if the bound is the force limit.
         where, weight: (k, terms) indices and values of the nonzero coefficients.
     """
 
@@ -56,13 +58,13 @@ class PointInequalities:
 
     @classmethod
     def from_workcell(cls, workcell: Workcell, robust: int = 0) -> PointInequalities:
-        """Return the inequalities of a workcell: both signs of signed quantities, and all branches
-        of the forces.
+        """Return the inequalities of a workcell.
+
+        A quantity that is limited in both signs has two of them, a normal force one per branch.
 
         Args:
             workcell: the cell.
-            robust: number of further forces after the quantities, each with one inequality, as both
-                forces of a grasp's program.
+            robust: number of robust forces at a point, each with one inequality.
         """
         layout = driven_layout(workcell)
         eye = np.eye(layout.size)
@@ -81,11 +83,12 @@ class PointInequalities:
         return cls(mix, is_force, where, np.take_along_axis(mix, where, axis=1))
 
     def slopes(self, slope: Array, point: NDArray[np.intp], kind: NDArray[np.intp]) -> Array:
-        """Return the derivatives (rows, ...) of inequalities.
+        """Return the derivatives (rows, n) of mix . quantities for some inequalities at some
+        points.
 
         Args:
-            slope: (points, quantities, ...) derivatives of the quantities.
-            point, kind: (rows,) point and inequality of each row.
+            slope: (points, quantities, n) derivatives of the quantities by n variables.
+            point, kind: (rows,) index of the point and of the inequality of each row.
         """
         terms = zip(self.where.T, self.weight.T, strict=True)
         return sum(
@@ -101,17 +104,19 @@ class IntervalGrid:
         workcell: the cell.
         intervals: number of pieces with constant u''.
         sample: (points,) index of the grid point of each point.
-        moving: number of entries of the extended pose and its two derivatives, 3 (6 + m).
-        kinds: inequalities of a point.
-        robust: robust forces, None if planned ones are limited.
-        layout: layout of the quantities.
+        moving: number of entries of the extended pose and its two derivatives by u, 3 (6 + m).
+        kinds: inequalities that apply at every point.
+        robust: computes robust forces; None if planned ones are limited.
+        layout: order of the quantities.
         load: slice of the load among the quantities.
-        rest: slice of the quantities that are limited at rest: the pressure, else load or forces.
-        has_pressure_limit: True if the pressure is limited at rest.
-        variables: number of variables of a point, see `DrivenLayout.variables`.
-        spread: (variables of the path, n_path) matrix from the program's variables to the path.
-        moved: (points, moving, n_path) derivatives of poses and derivatives by the program's
-            variables.
+        rest: slice of the quantities that are limited at rest: the pressure shifts, or without a
+            pressure limit the forces or the load from which they follow.
+        has_pressure_limit: True if the contact model limits the shift of the pressure.
+        variables: number of variables of the quantities at a point, see `DrivenLayout.variables`.
+        spread: (free waypoint values, n_path) matrix from the program's path variables to the free
+            waypoints.
+        moved: (points, moving, n_path) derivatives of the extended pose and its two derivatives by
+            the program's path variables.
         threads: number of threads that share the points.
     """
 
@@ -146,8 +151,9 @@ class IntervalGrid:
         self.variables = self.layout.variables
 
     def by_path(self, slope: Array, points: NDArray[np.intp]) -> Array:
-        """Convert derivatives (rows, moving) by the extended pose and its derivatives at points to
-        derivatives (rows, n_path) by the program's variables."""
+        """Convert derivatives (rows, moving) by the extended pose and its two derivatives, at the
+        points with indices `points` (rows,), to derivatives (rows, n_path) by the program's path
+        variables."""
         rows, columns = self.workcell.task.free_entries
         at = self.sample[points]
         by_path = sum(
@@ -160,19 +166,19 @@ class IntervalGrid:
         return np.asarray(by_path @ self.spread)
 
     def path(self, waypoints: Array) -> tuple[Array, Array, Array]:
-        """Return the extended pose and its two derivatives (intervals + 1, 6 + m) at the grid
-        points for extended waypoints (n_waypoints, 6 + m)."""
+        """Return the extended pose, its first and its second derivative by u, (intervals + 1, 6 +
+        m) each, at the grid points for extended waypoints (n_waypoints, 6 + m) [m, rad]."""
         first, second, third = (np.ascontiguousarray(b @ waypoints) for b in self._bases)
         return first, second, third
 
 
 class IntervalValues:
-    """Limited quantities of one driven path, and their derivatives.
+    """Limited quantities at the points of one driven path, and their derivatives.
 
     Attributes:
-        value: (points, quantities), followed by robust forces or the forces of a grasp's program.
-        slope: (points, quantities, moving + 2) derivatives by the extended pose and its
-            derivatives, u'' and u'^2, in which the joints follow the pose.
+        value: (points, quantities) values.
+        slope: (points, quantities, moving + 2) derivatives by the extended pose, its two
+            derivatives, u'' and u'^2. The joints follow the pose.
     """
 
     def __init__(
@@ -188,9 +194,10 @@ class IntervalValues:
         Args:
             grid: shared data.
             functions: compiled functions of the polish.
-            waypoints: (n_waypoints, 6 + m) extended waypoints.
-            squared: (intervals + 1,) u'^2 at the grid points.
-            near: (intervals + 1, n) for each arm, joint positions near those that hold the box.
+            waypoints: (n_waypoints, 6 + m) extended waypoints [m, rad].
+            squared: (intervals + 1,) u'^2 at the grid points [1/s^2].
+            near: (intervals + 1, n) for each arm, joint positions near those that hold the box
+                [rad].
         """
         self._grid, self._functions = grid, functions
         path, s, threads = grid.path(waypoints), grid.sample, grid.threads
@@ -219,14 +226,16 @@ class IntervalValues:
         self.value, self.slope = value, slope
 
     def at_rest(self, force: float) -> tuple[Array, Array]:
-        """Compute the use of the patches, or of the force limit [N], with the box at rest at the
-        beginning of every interval.
+        """Compute how much of a limit the box at rest uses at the beginning of every interval.
+
+        The limit is the pressure shift; for pads without a pressure limit it is the force limit.
 
         Args:
-            force: the force limit [N], which is used for pads with uniform pressure.
+            force: the force limit [N].
 
         Returns:
-            Shares (rows,) that are used, and their derivatives (rows, moving) by the extended pose.
+            Used shares (rows,), and their derivatives (rows, moving) by the extended pose and its
+            two derivatives.
         """
         begins = [values[::2] for values in self._inputs]
         still, grid = np.zeros(len(begins[-1])), self._grid
@@ -242,15 +251,14 @@ class IntervalValues:
         return value.reshape(-1) / whole, slope.reshape(-1, grid.moving) / whole
 
     def rows(self) -> Array:
-        """Return mix . quantities for every inequality (points, kinds)."""
+        """Return mix . quantities (points, k) for all k inequalities."""
         return np.asarray(self.value @ self._grid.kinds.mix.T)
 
     def curvature(self, weight: Array) -> tuple[NDArray[np.intp], Array]:
         """Compute the Hessian of weight . value at each point.
 
         Args:
-            weight: (points, quantities and further forces). Robust forces get the curvature of
-                planned ones.
+            weight: (points, quantities) weights. Robust forces get the curvature of planned ones.
 
         Returns:
             Indices (m,) of the points with a nonzero weight, and their Hessians (m, moving + 2,
@@ -308,8 +316,9 @@ def _by_load(pressed: Mapping[str, Array], slope: Array) -> Array:
 
 
 def _followed(grid: IntervalGrid, full: Array, follow: Sequence[Array]) -> Array:
-    """Eliminate the joints from derivatives, because they follow the pose. Return derivatives by
-    pose, its derivatives, u'' and u'^2."""
+    """Eliminate the joints from derivatives `full` by all variables of a point, because they follow
+    the pose with the derivatives `follow` of each arm. Return derivatives by the extended pose, its
+    two derivatives, u'' and u'^2."""
     slope = np.concatenate([full[:, :, : grid.moving], full[:, :, -2:]], axis=2)
     start = grid.moving
     for along in follow:
@@ -339,12 +348,14 @@ LEAST_SCALE = 1e-2
 
 @dataclass(frozen=True)
 class LinearisedRows:
-    """Linearised rows A d <= b for a step d: chosen rows of the timing, then all geometric rows.
+    """Linearised rows A d <= b for a step d: the chosen timing rows, then all geometric rows.
+
+    A timing row is one inequality at one point of the timing.
 
     Attributes:
-        A, b: the rows.
+        A, b: matrix and right side of the rows, divided by `scale`.
         scale: (rows,) divisors of the rows.
-        point, kind: (timing rows,) point and inequality of each row.
+        point, kind: (timing rows,) index of the point and of the inequality of each timing row.
     """
 
     A: BorderedRows
@@ -392,12 +403,12 @@ class PathTimingProgram:
         """Form the program about an iterate.
 
         Args:
-            grid: shared data.
+            grid: shared data of the workcell's programs.
             values: limited quantities of the iterate.
             x: (n_var,) decision vector of the iterate, the force limit last.
-            squared: (intervals + 1,) squared path speeds u'^2 of the iterate.
+            squared: (intervals + 1,) squared path speeds u'^2 of the iterate [1/s^2].
             cell: shared data of the polish.
-            required: required value of each geometric row.
+            required: value that each geometric row has to exceed.
             carry: the iterate at places of the path.
         """
         self._grid, self._values, self._x, self._force = grid, values, x, float(x[-1])
@@ -421,7 +432,8 @@ class PathTimingProgram:
         self._speeds(squared)
 
     def _still(self, values: IntervalValues) -> None:
-        """Append rows for the use at rest to the geometric rows, without their small curvature."""
+        """Append rows that limit the use at rest to the geometric rows, without their small
+        curvature."""
         share, slope = values.at_rest(self._force)
         near = np.flatnonzero(share > NEARLY_USED)
         begins = 2 * (near // (len(share) // self._grid.intervals))
@@ -430,8 +442,11 @@ class PathTimingProgram:
         self._geometry_slope = np.concatenate([self._geometry_slope, by_path])
 
     def _speeds(self, w: Array) -> None:
-        """Compute the duration and its derivatives, and the derivatives of u'' and u'^2 at each
-        point by omega."""
+        """Store the duration and its derivatives by omega, and those of u'' and u'^2 at each point.
+
+        Args:
+            w: (intervals + 1,) squared path speeds u'^2 of the iterate [1/s^2].
+        """
         n = self._grid.intervals
         root = np.sqrt(w)
         pair = root[:-1] + root[1:]
@@ -458,8 +473,8 @@ class PathTimingProgram:
         self._column = np.clip(np.repeat(np.arange(n), 2) - 1, 0, n - 3)
 
     def geometry_after(self, d: Array) -> Array:
-        """Return the nonlinearity (geometric rows,) of a step: the violations after the step minus
-        their linear prediction."""
+        """Return each geometric row's nonlinearity (geometric rows,) along a step d (n,): the
+        violation after the step minus its linear prediction."""
         x, step = self._x.copy(), d[: self.n_path]
         x[: len(self._spread)] += self._spread @ step
         lacking = self._required - self._places.values(x)
@@ -469,14 +484,16 @@ class PathTimingProgram:
         return beyond
 
     def near_rows(self) -> NDArray[np.bool_]:
-        """Return a mask (points, kinds) of the limits that the iterate nearly uses."""
+        """Return a mask (points, kinds) of the timing rows that are near their bounds at the
+        iterate."""
         rest = min(self._grid.workcell.task.force_limit[0] / self._force, 1.0)
         for_forces = (1.0 - NEARLY_USED_FORCE) * (rest - 1.0)
         threshold = np.where(self._grid.kinds.is_force, for_forces, NEARLY_USED - 1.0)
         return np.asarray(self.rows > threshold)
 
     def predicted(self, d: Array) -> Array:
-        """Return a linear prediction of the timing's rows (points, kinds) after a step d."""
+        """Predict linearly the timing rows (points, kinds), less their bounds, after a step d
+        (n,)."""
         omega = d[self.speeds]
         moved = self._grid.moved @ d[: self.n_path]
         beside = np.stack([omega[self._column], omega[self._column + 1]], axis=1)
@@ -488,9 +505,8 @@ class PathTimingProgram:
         """Return the linearised rows of a step.
 
         Args:
-            chosen: (points, kinds) mask of the timing's rows that are included; all geometric rows
-                are.
-            bent: (geometric rows,) nonlinearity that is added to the geometric rows.
+            chosen: (points, kinds) mask of the timing rows to include.
+            bent: (geometric rows,) nonlinearity along an earlier step, added to the geometric rows.
         """
         self._learn(*np.nonzero(chosen & ~self._known))
         point, kind = np.nonzero(chosen)
@@ -509,8 +525,7 @@ class PathTimingProgram:
         return LinearisedRows(A, b, scale, point, kind)
 
     def _learn(self, point: NDArray[np.intp], kind: NDArray[np.intp]) -> None:
-        """Compute and store the derivatives of rows of the timing, given by points and
-        inequalities."""
+        """Compute and store the derivatives of timing rows, given by points and inequalities."""
         kinds, moving = self._grid.kinds, self._grid.moving
         local = kinds.slopes(self._values.slope, point, kind) / self.scale[kind, None]
         self._by_path[point, kind] = self._grid.by_path(local[:, :moving], point)
@@ -518,11 +533,11 @@ class PathTimingProgram:
         self._known[point, kind] = True
 
     def gradient(self) -> Array:
-        """Return the gradient (n_variables,) of the objective."""
+        """Return the gradient (n,) of the objective T / T_0."""
         return np.concatenate([np.zeros(self.n_path), self.cost])
 
     def gain(self, d: Array) -> float:
-        """Return the predicted relative reduction of the duration by a step d."""
+        """Predict to second order the relative reduction of the duration by a step d (n,)."""
         omega = d[self.speeds]
         bent = self.cost_diagonal @ omega**2 / 2.0 + self.cost_beside @ (omega[:-1] * omega[1:])
         return -float(self.cost @ omega + bent)
@@ -530,8 +545,8 @@ class PathTimingProgram:
     def curvature(
         self, linear: LinearisedRows | None = None, rows: Array | None = None
     ) -> BorderedMatrix:
-        """Return the Hessian of the duration, or of the Lagrangian if linearised rows and their
-        multipliers (rows,) are given."""
+        """Return the Hessian of the objective, or of the Lagrangian if linearised rows `linear` and
+        their multipliers `rows` (rows,) are given."""
         n_path, n = self.n_path, len(self.cost)
         corner, beside = np.zeros((n_path, n_path)), np.zeros((n, n_path))
         diagonal, off = self.cost_diagonal.copy(), self.cost_beside.copy()
@@ -564,8 +579,8 @@ class PathTimingProgram:
         """Compute the optimality residuals of the iterate with the multipliers of a step.
 
         Args:
-            bounds: (n_variables,) signed multipliers of the variables' own bounds.
-            linear: rows of the step at the iterate.
+            bounds: (n,) multipliers of the variables' own bounds, positive for upper ones.
+            linear: linearised rows at the iterate.
             multipliers: (rows,) multipliers of these rows.
         """
         lagrangian = self.gradient() + linear.A.transpose_times(multipliers) + bounds

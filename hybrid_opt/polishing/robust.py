@@ -35,7 +35,7 @@ ROBUST_ROWS = 2 * GOVERNING_CASES
 
 
 class RobustSamples:
-    """Robust forces at the samples of carries of one workcell."""
+    """Computes robust forces at the samples of a workcell's carries."""
 
     def __init__(self, workcell: Workcell) -> None:
         """Load or build the compiled functions.
@@ -51,14 +51,24 @@ class RobustSamples:
         self._motion = interpret(motion_function(workcell.task))
 
     def forces(self, found: Mapping[str, Array]) -> Array:
-        """Compute the robust forces (n, 2) [N] at n samples from the evaluator's outputs for one
-        candidate."""
+        """Compute the robust forces (n, 2) [N] of both robots at n samples.
+
+        Args:
+            found: the evaluator's outputs for one candidate, of which pose, rate and second rate
+                (n, 6) are used.
+        """
         motion = BoxMotion(*[found[name] for name in ("pose", "rate", "second_rate")])
         return self._governing(motion).force
 
     def first(self, x: Array) -> tuple[Array, Array]:
-        """Compute the robust forces (n, 2) [N] of a decision vector x (n_var,), and their
-        derivatives (n, 2, n_var) by x."""
+        """Compute the robust forces of a decision vector, and their first derivatives.
+
+        Args:
+            x: (n_var,) decision vector.
+
+        Returns:
+            Forces (n, 2) [N] at n samples, and their derivatives (n, 2, n_var) by x.
+        """
         out = self._motion.batch(np.ascontiguousarray(x)[None])
         rows = out["motion"][0]
         by_x = out["slope"][0].reshape(*rows.shape, len(x))
@@ -79,22 +89,28 @@ class RobustSamples:
 
 
 class RobustForces:
-    """Robust forces of both robots at points of a driven path of one workcell."""
+    """Computes robust forces of both robots at points of a driven path of one workcell."""
 
     def __init__(self, workcell: Workcell, pose: int) -> None:
-        """Prepare for extended poses with `pose` entries."""
+        """Prepare the forces.
+
+        Args:
+            workcell: the workcell.
+            pose: number of entries of an extended pose.
+        """
         self._forces, self._pose = robust_path(workcell), pose
         self._branches = planned_branches(workcell)
 
     def at(self, path: Sequence[Array], a: Array, w: Array) -> tuple[Array, Array]:
-        """Compute robust forces (points, ROBUST_ROWS) [N] and their slopes (points, ROBUST_ROWS, 3
-        pose + 2).
-
-        Slopes are by the extended pose, its two derivatives by u, u'' and u'^2.
+        """Compute the robust forces of the most demanding cases, and their slopes.
 
         Args:
-            path: extended poses and their two derivatives by u, (points, pose) each.
-            a, w: (points,) u'' and u'^2.
+            path: extended poses, and their first and second derivatives by u, (points, pose) each.
+            a, w: (points,) path acceleration u'' and squared path speed u'^2 [1/s^2].
+
+        Returns:
+            Forces (points, ROBUST_ROWS) [N], and their derivatives (points, ROBUST_ROWS, 3 pose +
+            2) by the extended pose, its two derivatives by u, u'' and u'^2.
         """
         pose, first, second = (np.ascontiguousarray(part[:, :6]) for part in path)
         force, slope = self._forces.most_demanding(
@@ -109,11 +125,19 @@ class RobustForces:
         return force.reshape(n, ROBUST_ROWS), found
 
     def planned_weights(self, weight: Array, value: Array) -> Array:
-        """Return weights (points, quantities) that give robust forces the curvature of planned
-        forces.
+        """Replace the multipliers of robust forces by multipliers of the planned forces' branches.
+
+        The Hessian of a Lagrangian with these multipliers has the curvature of planned forces in
+        place of the curvature of robust forces.
 
         Args:
-            weight, value: (points, quantities and robust forces) multipliers and values.
+            weight: (points, quantities + ROBUST_ROWS) multipliers of the quantities, then of the
+                robust forces.
+            value: (points, quantities + ROBUST_ROWS) values of the quantities, then the robust
+                forces.
+
+        Returns:
+            (points, quantities) multipliers of the quantities.
         """
         size = weight.shape[1] - ROBUST_ROWS
         found = weight[:, :size].copy()

@@ -36,8 +36,11 @@ from translation: the least forces at the ends of a path are in that kink."""
 
 @dataclass(frozen=True, order=True)
 class ForceRow:
-    """One branch of a robot's normal force at a sample, bounded by the robot's peak force. The
-    branch is `PROGRAM_BRANCH` if a convex program computes the force."""
+    """The row that keeps one branch of a robot's normal force at a sample below its peak force.
+
+    A branch is one of the linear functions whose maximum is the normal force. It is
+    `PROGRAM_BRANCH` if a convex program computes the force.
+    """
 
     robot: int
     branch: int
@@ -46,7 +49,7 @@ class ForceRow:
 
 @dataclass(frozen=True, order=True)
 class PressureRow:
-    """Distance of a robot's centre of pressure from the rim of its patch at a sample."""
+    """The row that keeps a robot's centre of pressure within its patch at a sample."""
 
     robot: int
     sample: int
@@ -54,7 +57,7 @@ class PressureRow:
 
 @dataclass(frozen=True)
 class PathRow:
-    """One geometric constraint at one place of the path."""
+    """The row of one geometric constraint at one place of the path."""
 
     constraint: PathConstraint
     place: int
@@ -70,11 +73,12 @@ def _sort_key(constraint: PathConstraint) -> tuple[str, str]:
 
 
 class RowLayout:
-    """Order of a program's rows in blocks, each sorted: forces, objectives, patches, places.
+    """Order of a program's rows: blocks of forces, objectives, patches and places, each sorted.
 
     Attributes:
-        force_rows, pressure_rows, place_rows: rows of each block.
-        forces, sides, patches, places: slices of the blocks.
+        force_rows, pressure_rows, place_rows: rows of the blocks of forces, patches and places.
+        forces, sides, patches, places: position of each block among all rows, as a slice; `sides`
+            is the block of objectives.
         n_rows: number of all rows.
     """
 
@@ -97,7 +101,7 @@ class _SampleRows:
     Attributes:
         column: (n_samples,) position of each sample among the values, -1 if it is not evaluated.
         found, gradients: (count, width) values and (count, width, n_var) gradients of the last
-            evaluation.
+            evaluation, for `count` evaluated samples and `width` numbers per sample.
         given: arguments for `rows.cpp`.
     """
 
@@ -108,10 +112,11 @@ class _SampleRows:
 
         Args:
             cell: shared data of the polish.
-            quantity: the quantity.
-            wanted: indices of the needed samples; calls without any of them are left out.
-            beyond: number of further rows of values, which another function writes after those of
-                the samples.
+            quantity: name of the quantity: force, pressure or load.
+            wanted: indices of the needed samples. A function that serves several samples is called
+                if any of them is needed.
+            beyond: number of further rows of `found` behind the samples, which another function
+                writes.
         """
         built = cell.functions.built
         chosen = [
@@ -150,8 +155,13 @@ class _SampleRows:
 
 
 def _all_directions(second: NumericFunction, n: int, n_var: int) -> PreparedBatch:
-    """Prepare the second derivatives of n samples along every direction of x, n_var evaluations per
-    sample."""
+    """Prepare the second derivatives of a quantity at n samples along every direction of x.
+
+    Args:
+        second: function that evaluates second derivatives along one direction.
+        n: number of samples; each takes `n_var` evaluations.
+        n_var: number of decision variables.
+    """
     batch = second.prepared(n * n_var, ("x", "rounding"))
     batch.inputs["rounding"][...] = TIME_LAW_ROUNDING
     batch.inputs["along"][...] = np.tile(np.eye(n_var), (n, 1))
@@ -159,12 +169,11 @@ def _all_directions(second: NumericFunction, n: int, n_var: int) -> PreparedBatc
 
 
 class ConstraintRows:
-    """Rows of one program as functions of x (n_var,) and, linearly, of further variables (the
-    tail). An object serves one thread.
+    """Values and derivatives of a program's rows by x (n_var,) and k further variables, the tail.
 
-    value_r = offset_r + fixed_r . tail + own value. The own value of a force row is mix_r . (the
-    two values of its sample), that of a pressure row the remaining patch, that of a place row a
-    constraint over its scale.
+    The value of row r is offset_r + fixed_r . tail + own_r(x). For a force row own_r is mix_r times
+    the two force quantities of its sample; for a pressure row the unused share of the patch; for a
+    place row the constraint over its scale. Use an object in one thread only.
 
     Attributes:
         offset: (n_rows,) offsets, to be set by the caller.
@@ -178,16 +187,17 @@ class ConstraintRows:
         mix: Array | None = None,
         fixed: Array | None = None,
     ) -> None:
-        """Arrange all arrays.
+        """Prepare the functions and arrays of all rows.
 
         Args:
             cell: shared data of the polish.
             layout: order of the rows.
             q: (m, n) for each arm, joint positions at all places near those that hold the box
                 [rad].
-            mix: (n_forces, 2) coefficients of each force row: of F_n and F_t for the paper's
-                branches, of both normal forces for a grasp's program.
-            fixed: (n_rows, k) coefficients of the k further variables.
+            mix: (n_forces, 2) coefficients of each force row: of the normal and tangential part of
+                the required force for the paper's contact model, of both normal forces if a convex
+                program computes them. None without force rows.
+            fixed: (n_rows, k) coefficients of the k further variables; None for k = 0.
 
         Raises:
             DualArmError: a function cannot be built.
@@ -201,11 +211,11 @@ class ConstraintRows:
         )
 
     def _lay_out_samples(self, layout: RowLayout) -> dict[str, Any]:
-        """Arrange the values of forces and pressure.
+        """Return the arguments of `rows.cpp` for force and pressure rows.
 
-        Forces without closed form follow from a sample's load
-        (`symbolic.smooth.samples.grasp_force_functions`). Their derivatives follow by the chain
-        rule, so that the program is solved once per load.
+        Forces without closed form follow from a sample's load by a convex program
+        (`symbolic.smooth.samples.grasp_force_functions`), which is solved once per load. Their
+        derivatives follow by the chain rule.
         """
         cell, rows = self._cell, layout.force_rows
         own = sorted({row.sample for row in rows if row.branch == PROGRAM_BRANCH})
@@ -247,8 +257,13 @@ class ConstraintRows:
         }
 
     def _lay_out_places(self, layout: RowLayout, q: tuple[Array, Array]) -> dict[str, Any]:
-        """Group the rows at places by their functions. The joints of each place are solved for
-        once."""
+        """Return the arguments of `rows.cpp` for place rows, grouped by their functions.
+
+        Args:
+            layout: order of the rows.
+            q: (m, n) for each arm, joint positions at all places near those that hold the box
+                [rad]. The joints of each place are solved for once.
+        """
         cell, rows = self._cell, layout.place_rows
         members: dict[NumericFunction, list[int]] = {}
         for k, row in enumerate(rows):
@@ -325,7 +340,11 @@ class ConstraintRows:
         }
 
     def values(self, x: Array, tail: Array | None = None) -> Array:
-        """Return the values (n_rows,) of all rows at x and the further variables.
+        """Compute the values (n_rows,) of all rows.
+
+        Args:
+            x: (n_var,) decision vector.
+            tail: (k,) further variables; None for k = 0.
 
         Raises:
             CodegenError: a function failed.
@@ -335,13 +354,17 @@ class ConstraintRows:
         return np.asarray(self.offset + found)
 
     def slopes(self) -> Array:
-        """Return the derivatives (n_rows, n_var + k) of all rows by all variables, at the last
-        evaluation."""
+        """Return the derivatives (n_rows, n_var + k) of all rows by x and the k further variables,
+        at the last x of `values`."""
         return np.asarray(self._native.slopes())
 
     def curvature(self, multipliers: Array) -> Array:
-        """Return the Hessian (n_var, n_var) of multipliers . values by x, for multipliers
-        (n_rows,), at the x of the last slopes.
+        """Compute the Hessian (n_var, n_var) by x of multipliers . values.
+
+        It belongs to the x at which `slopes` was called last.
+
+        Args:
+            multipliers: (n_rows,) weights of the rows.
 
         Raises:
             CodegenError: a function failed.
@@ -350,30 +373,39 @@ class ConstraintRows:
 
     @property
     def forces(self) -> Array:
-        """Return the two sample values (n_forces, 2) of each force row at the last evaluation."""
+        """The two force quantities (n_forces, 2) [N] of each force row's sample at the last x."""
         return self._forces.found[self._column]
 
     @property
     def force_slopes(self) -> Array:
-        """Return the derivatives (n_forces, 2, n_var) of `forces` by x; undefined for a grasp's
-        program."""
+        """The derivatives (n_forces, 2, n_var) of `forces` by x; undefined if a convex program
+        computes the forces."""
         return self._forces.gradients[self._column]
 
     @property
     def left(self) -> Array:
-        """Return the remaining shares of the patches (n_patches,) at the last evaluation."""
+        """The unused shares of the patches (n_patches,) at the last x: one less the square of the
+        pressure shift over the patch radius."""
         return self._patches.found.ravel()[self._pressed]
 
     def correct_forces(self, slope: Array, x: Array) -> None:
-        """Add a correction (n_forces, n_var) to the derivatives of force rows, and the resulting
-        change at distance from x to their values."""
+        """Add a linear function slope_r . (x' - x) of the decision vector x' to each force row r.
+
+        Args:
+            slope: (n_forces, n_var) slopes of the function.
+            x: (n_var,) decision vector at which the function is zero.
+        """
         self._native.correct(slope, x)
 
 
 def row_numbers(
     constraints: Sequence[PathConstraint], functions: PolishFunctions
 ) -> tuple[Array, ...]:
-    """Return an array (rows, n) with the parameters of constraints of one family, as a tuple of one
-    entry; an empty tuple if the family has no parameters."""
+    """Collect the parameters of constraints that share one compiled function.
+
+    Returns:
+        A tuple with one array (n constraints, n parameters); an empty tuple if the constraints have
+        no parameters.
+    """
     numbers = np.array([functions.numbers(constraint) for constraint in constraints])
     return (numbers,) if numbers.shape[1] else ()
