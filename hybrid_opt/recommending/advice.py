@@ -55,12 +55,14 @@ LEAST_HEIGHT = 2e-3
 
 @dataclass(frozen=True)
 class Advice:
-    """Effect of one change of the cell or of one via-point on a carry with the same path otherwise.
+    """Effect of one change, of the cell or of one via-point, on the force and duration of a carry.
+
+    `force` and `duration` state the same effect in two ways.
 
     Attributes:
-        change: the changed quantity with the size of its change.
-        force: change of the commanded force at the same duration [N].
-        duration: change of the duration at the same commanded force [s].
+        change: changed quantity and the size of its change, as text.
+        force: change of the commanded force at an unchanged duration [N].
+        duration: change of the duration at an unchanged commanded force [s].
     """
 
     change: str
@@ -72,22 +74,27 @@ class Advice:
 
 
 def commanded_margins(carry: Carry, forces: Array) -> tuple[Margin, ...]:
-    """Compute the largest deviation of each quantity of the cell at which the commanded forces
-    still hold the box along a carry.
+    """Compute how far friction, mass and centre of mass may be off before the commanded forces no
+    longer hold the box along a carry.
 
-    The quantities are friction, mass and centre of mass. Only one deviates at a time.
+    Only one quantity deviates at a time. One more margin states which share of the commanded force
+    may be missing.
 
     Args:
         carry: the carry at n samples.
-        forces: (n, 2) commanded normal forces [N].
+        forces: (n, 2) commanded normal force of each robot [N].
     """
     workcell, model = carry.workcell, robust_model(carry.workcell)
     rows, motion = subsample(carry)
     enough, nominal = forces[rows, 1 - LEADER] * (1.0 + HOLDS), nominal_case(workcell)
 
     def last(change: Array, end: float) -> tuple[float, str]:
-        """Find the largest multiple of a change, up to `end`, at which the forces still hold the
-        box, and the failure beyond it. The needed forces rise with the change."""
+        """Find the largest multiple of a change of the nominal case (18,), up to `end`, at which
+        the forces still hold the box.
+
+        Also return the name of the failure beyond this multiple; '' if the multiple is `end`. The
+        needed force has to rise with the multiple.
+        """
         low, high = 0.0, end
         for step in range(MARGIN_BISECTIONS):
             middle = end if step == 0 else (low + high) / 2.0
@@ -123,12 +130,13 @@ def commanded_margins(carry: Carry, forces: Array) -> tuple[Margin, ...]:
 
 
 def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tuple[Advice, ...]:
-    """Compute the effects of changes of the cell on a carry, the largest decrease of force first.
+    """Compute the effects of small changes of the cell and of via-points on a carry, the largest
+    decrease of the commanded force first.
 
     Args:
         cell: the drivable cell.
         paths: paths of the front.
-        option: option of the recommended carry.
+        option: path and force limit of the recommended carry.
         timing: timing of the recommended carry.
     """
     assert timing.carry is not None, "what is driven has a carry"
@@ -147,8 +155,9 @@ def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tu
         slope = float((durations[high] - durations[low]) / (forces[high] - forces[low]))
 
     def in_time(force: float) -> float:
-        """Convert a change of the commanded force [N] to the change of duration at the same force
-        [s]."""
+        """Convert a change of the commanded force at the same duration [N] to the change of
+        duration [s] if the commanded force stays as it is.
+        """
         spare = float(np.interp(option.commanded - force, forces, durations))
         lost = max(forces[0] - (option.commanded - force), 0.0)
         return float(spare - slope * lost - np.interp(option.commanded, forces, durations))
@@ -161,9 +170,16 @@ def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tu
 
 
 def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str, float]]:
-    """Yield changes of the cell by name, each with the rise of the largest commanded force along a
-    motion [N]. Where a change makes hands stronger, it is the rise of the same share of today's
-    holding force."""
+    """Yield small changes of the cell as text, each with the rise of the largest commanded force
+    along a motion [N]; a fall is negative.
+
+    A larger cup also holds more: the commanded force of the changed cell is then divided by the
+    ratio of the new to the present holding force.
+
+    Args:
+        workcell: the cell.
+        motion: motion of the box.
+    """
     doubt = workcell.uncertainty
     now = robust_model(workcell).commanded(motion, doubt, LEADER)
     at = motion.at(np.argsort(-now)[:LOOKED_AT])
@@ -194,8 +210,9 @@ def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str
 
 
 def _height(workcell: Workcell) -> tuple[Array, float]:
-    """Compute the upward direction (3,) in the box frame at the start, and the height [m] of the
-    pads over the centre of mass, as the mean of both robots."""
+    """Compute the world's upward direction (3,) in the box frame at the start, and the height [m]
+    of the pads' centres above the centre of mass, averaged over both robots.
+    """
     pose = workcell.task.waypoints[0].lower
     up: Array = box_rotation(workcell.task.orientation, pose)[2]
     middles = [
@@ -233,21 +250,33 @@ def _wider(pad: Contact) -> Contact:
 
 
 def _larger(cup: Contact) -> Contact:
-    """Return a larger cup, whose vacuum pulls on a larger area."""
+    """Return a suction cup with a radius larger by `LARGER_CUP`; its holding force grows with its
+    area.
+    """
     radius = cup.patch_radius + LARGER_CUP
     force = cup.holding_force * (radius / cup.patch_radius) ** 2
     return replace(cup, patch_radius=radius, holding_force=force)
 
 
 def _strength(workcell: Workcell, other: Workcell) -> float:
-    """Return the weaker holding force of another cell over that of a cell; 1 for pads."""
+    """Return the ratio of the weakest holding force in the cell `other` to the weakest one in
+    `workcell`; 1 for pads, which do not hold by themselves.
+    """
     own, new = (min(c.holding_force for c in cell.contacts) for cell in (workcell, other))
     return new / own if own else 1.0
 
 
 def _of_pitch(cell: Cell, path: Array, option: Option, slope: float) -> Iterator[Advice]:
-    """Yield the effect of one degree more pitch at each via-point, in the direction that shortens
-    the carry. Positions without a feasible carry are left out."""
+    """Yield the effect of one degree more, or less, pitch at each via-point, if it shortens the
+    carry at the same commanded force. Via-points at which the changed path has no timing are left
+    out.
+
+    Args:
+        cell: the drivable cell.
+        path: (n_path,) decision vector of the carry without its force limit.
+        option: timing of this path within a force limit.
+        slope: change of the duration per newton of commanded force [s/N].
+    """
     if slope == 0.0:
         return
     task, varied, names = cell.workcell.task, [], []

@@ -43,17 +43,18 @@ SAMPLES_PRESSED = 32
 
 @dataclass(frozen=True)
 class Wish:
-    """Target of a recommendation, and changes of the cell for it.
+    """Target of a recommendation, and changes of the cell for which it is made.
 
-    Without a duration or a force, the product of duration and commanded force is minimised.
+    `duration` and `force` exclude each other. Without either, the product of duration and commanded
+    force is minimised.
 
     Attributes:
         duration: longest allowed duration of the carry within the jerk limits [s]; the commanded
             force is then minimised.
         force: largest allowed commanded force [N]; the duration is then minimised.
-        payload: mass of the payload in place of the cell's [kg]; the inertia grows in proportion.
+        payload: mass of the payload in place of the cell's [kg]; its inertia grows in proportion.
         reference_force: reference force of both robots in place of the cell's [N].
-        uncertainty: uncertainty in place of the cell's; None keeps a value.
+        uncertainty: uncertainty in place of the cell's; None keeps the cell's.
     """
 
     duration: float | None = None
@@ -63,10 +64,10 @@ class Wish:
     uncertainty: Uncertainty | None = None
 
     def __post_init__(self) -> None:
-        """Check the wish.
+        """Check the values of the wish.
 
         Raises:
-            SettingsError: both targets are given, or a value is not positive.
+            SettingsError: both a duration and a force are given, or a number is not positive.
         """
         if self.duration is not None and self.force is not None:
             raise SettingsError(
@@ -80,8 +81,9 @@ class Wish:
 
     @property
     def numbers(self) -> dict[str, float]:
-        """The numbers of the wish that are given, by name of their attribute. The uncertainty is
-        not among them."""
+        """Numbers of the wish that are not None, by attribute name; the uncertainty is not among
+        them.
+        """
         values = {name: getattr(self, name) for name in _UNITS}
         return {name: value for name, value in values.items() if value is not None}
 
@@ -145,7 +147,7 @@ def _listed(wish: Wish) -> str:
 
 @dataclass(frozen=True)
 class Goal:
-    """Limits that an option has to keep, and its cost.
+    """Limits that a timed path has to keep, and the cost by which timed paths are compared.
 
     Attributes:
         longest: largest allowed duration [s].
@@ -159,8 +161,9 @@ class Goal:
 
     @classmethod
     def of(cls, wish: Wish, workcell: Workcell) -> Goal:
-        """Build the goal of a wish. Forces are limited by the robots' reference forces in any
-        case."""
+        """Convert a wish to limits and a cost. Whatever the wish, each robot's force is limited by
+        its reference force.
+        """
         allowed, longest = workcell.task.reference_force, math.inf
         cost: Callable[[float, float], float] = operator.mul
         if wish.force is not None:
@@ -171,11 +174,12 @@ class Goal:
 
 
 def commanded_at_most(force: float, others: Array | float = np.inf) -> Array:
-    """Return the largest allowed forces (2,) [N] of both robots if the commanded force is limited.
+    """Return the largest allowed normal force (2,) of each robot [N] if the commanded force is
+    limited.
 
     Args:
-        force: largest commanded force of the force-controlled arm [N].
-        others: further limit on the forces, one for both robots or one per robot (2,) [N].
+        force: largest allowed force of the force-controlled arm [N].
+        others: further upper bound of the forces, one for both robots or one per robot (2,) [N].
     """
     found = np.broadcast_to(others, 2).astype(float)
     found[1 - LEADER] = min(found[1 - LEADER], force)
@@ -193,14 +197,15 @@ def force_alone(duration: float, force: float) -> float:
 
 
 class DrivenPaths:
-    """Paths of one cell with stored geometry, which can be timed repeatedly within force limits.
+    """Paths of one drivable cell, with stored geometry, to be timed repeatedly within force limits.
 
-    Timings satisfy all limits of the cell's drivable carries.
+    A timing satisfies all limits of the cell's drivable carries except those on jerk.
 
     Attributes:
-        x: (k, n_path) decision vectors of the k paths without force limit.
+        x: (k, n_path) decision vectors of k paths, without the force limit.
         highest_force: largest force limit that is tried [N].
-        robust: True if force limits bound the robust forces, False if the planned forces.
+        robust: True if force limits bound the robust forces, False if they bound the planned
+            forces.
     """
 
     def __init__(self, cell: Cell, x: Array) -> None:
@@ -220,14 +225,14 @@ class DrivenPaths:
     def _driven(
         self, force: Array | float, rows: Sequence[int] | None = None
     ) -> list[tuple[int, float, PathTiming]]:
-        """Time paths within force limits.
+        """Compute the fastest timing of paths within force limits.
 
         Args:
             force: force limit, one per timed path or one for all [N].
-            rows: indices of the paths; None for all.
+            rows: indices of the paths to time; None for all.
 
         Returns:
-            For each path its index, the limit, and the fastest timing.
+            For each timed path its index, its force limit [N], and its timing.
         """
         chosen = list(range(len(self)) if rows is None else rows)
         limits = np.broadcast_to(np.asarray(force, dtype=float), (len(chosen),))
@@ -254,7 +259,8 @@ class DrivenPaths:
         return np.array([timing.duration for _, _, timing in self._driven(force)])
 
     def options(self, force: Array | float, rows: Sequence[int] | None = None) -> list[Option]:
-        """Time paths within force limits and return one option per path that has a timing.
+        """Compute the fastest timing of paths within force limits; paths without such a timing are
+        left out.
 
         Args:
             force: force limit, one per timed path or one for all [N].
@@ -285,10 +291,10 @@ class DrivenPaths:
     def all_options(
         self, own: Array | float, told: Callable[[], None] = lambda: None
     ) -> list[Option]:
-        """Return the options of every path: within the path's own force limit and within further
-        limits.
+        """Compute timings of every path: one within the path's own force limit, and one within each
+        of `FORCES` further limits.
 
-        The further limits are `FORCES` limits from just above the force at rest to `highest_force`.
+        The further limits lie between a little more than the force at rest and `highest_force`.
         They are left out if force limits bound robust forces.
 
         Args:
@@ -312,12 +318,12 @@ class DrivenPaths:
 
 @dataclass(frozen=True)
 class Option:
-    """A path timed within a force limit.
+    """One path, timed within one force limit.
 
     Attributes:
-        index: index of the path.
+        index: index of the path in its `DrivenPaths`.
         limit: force limit [N].
-        duration: duration of the timing without jerk limits [s].
+        duration: duration of the timing, without regard to jerk limits [s].
         force: (2,) largest robust force of each robot [N].
     """
 
@@ -345,14 +351,15 @@ def ranked(options: Sequence[Option], goal: Goal) -> list[Option]:
 def best_of_paths(
     paths: DrivenPaths, options: Sequence[Option], goal: Goal, most: int
 ) -> Iterator[Option]:
-    """Yield the cheapest option of each of the best paths, cheapest first.
+    """Yield the cheapest timing of each of the best paths that keeps the limits of a goal, cheapest
+    first.
 
-    Force limits between the limits of the known options are tried too.
+    Force limits between those of the given timings are tried as well.
 
     Args:
-        paths: the paths of the options.
-        options: known options.
-        goal: limits and cost of an option.
+        paths: paths to which the timings belong.
+        options: timings that are known already.
+        goal: limits, and cost to minimise.
         most: largest number of paths.
     """
     best: dict[int, Option] = {}
@@ -372,10 +379,12 @@ def best_of_paths(
 
 
 def gentle_start(cell: Cell) -> Array:
-    """Return the decision vector (n_var,) of the hand-made carry with its best force limit.
+    """Return the decision vector (n_var,) of the hand-made path with the force limit that suits it
+    best.
 
-    The best limit gives the least product of duration and commanded force with forces within the
-    reference forces. If no limit does, the limit with the least commanded force is taken.
+    This limit gives the least product of duration and commanded force, with forces within the
+    reference forces. If every limit leads to larger forces, the limit with the least commanded
+    force is taken.
 
     Args:
         cell: drivable cell.
@@ -389,16 +398,16 @@ def gentle_start(cell: Cell) -> Array:
 
 
 def refuse(options: Sequence[Option], wish: Wish, goal: Goal, budget: GripBudget) -> None:
-    """Raise an error with the possible values if no option fulfils a wish.
+    """Raise an error that states the possible durations and forces if no timed path fulfils a wish.
 
     Args:
-        options: options of the front's paths.
+        options: timed paths of the front.
         wish: the wish, for the message.
-        goal: limits of the wish.
+        goal: limits that follow from the wish.
         budget: grip budget of the cell, for the message.
 
     Raises:
-        SettingsError: no option fulfils the wish.
+        SettingsError: no timed path fulfils the wish.
     """
     if ranked(options, goal):
         return

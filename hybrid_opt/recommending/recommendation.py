@@ -126,7 +126,9 @@ class Recommendation(Displayable):
 
     @property
     def objection(self) -> str:
-        """Reason not to run the carry, with a remedy; '' if the reference forces suffice."""
+        """Reason not to run the carry, with a remedy; '' if the required forces are within the
+        reference forces.
+        """
         if self.fits:
             return ""
         return f"no carry fits: {self.budget}; {remedies_text(self.remedies, 'for this carry')}"
@@ -139,8 +141,9 @@ class Recommendation(Displayable):
 
     @property
     def duration(self) -> float:
-        """Duration of the carry as robots drive it [s]: the duration in the job, whose phases last
-        whole ticks."""
+        """Duration of the carry as robots drive it [s], rounded up to whole ticks if a job is
+        planned.
+        """
         return self.timing.duration if self.job is None else self.job.phase("carry").duration
 
     @property
@@ -285,11 +288,21 @@ def _recommended(
 def _driven(
     cell: Cell, paths: DrivenPaths, options: Sequence[Option], goal: Goal, wished: bool
 ) -> tuple[Option, Timing, bool]:
-    """Choose the best carry after timing the best paths without jumps of acceleration.
+    """Choose the carry to recommend, after timing the best paths without jumps of acceleration.
+
+    Args:
+        cell: drivable cell.
+        paths: paths of the front.
+        options: timings of the paths with jumps of acceleration.
+        goal: limits, and cost to minimise.
+        wished: True if the user gave a target. Otherwise, if no carry keeps the limits, the carry
+            is chosen that exceeds the force limits least.
 
     Returns:
-        Option and timing of the carry, and True if it fulfils the goal. Without a target, a carry
-        that exceeds the goal least is accepted if none fulfils it.
+        Path and force limit of the carry, its timing, and True if it keeps the limits of the goal.
+
+    Raises:
+        SettingsError: no carry can be driven as wished.
     """
     kept, others, reason, model = [], [], "", cell.timing_model
     for first in best_of_paths(paths, options, goal, TRIED):
@@ -324,9 +337,11 @@ def _driven(
 
 
 def required_forces(workcell: Workcell, carry: Carry) -> Array:
-    """Compute the largest normal force (2,) [N] of each robot in any case of the uncertainty.
+    """Compute the largest normal force (2,) [N] that each robot needs along a carry in any case of
+    the uncertainty.
 
-    It is the commanded force of the force-controlled arm and the resulting force of the leader.
+    For the force-controlled arm it is the commanded force, for the position-controlled arm the
+    force that results from it.
     """
     uncertainty, (rows, motion) = workcell.uncertainty, subsample(carry)
     most = largest_commanded(workcell, motion, carry.normal_force[rows], uncertainty, LEADER)
@@ -336,7 +351,12 @@ def required_forces(workcell: Workcell, carry: Carry) -> Array:
 
 
 def _objections(found: CommandedForces) -> list[str]:
-    """Return objections against the commanded forces of a carry, as sentences."""
+    """Return sentences that object to running a carry: no job is possible, no uncertainty is
+    stated, or a stop of one arm would pull the pads too far apart.
+
+    Args:
+        found: commanded forces of the carry, with its job.
+    """
     squeeze, doubts = found.squeeze, []
     if found.job is None:
         doubts.append(f"no job can be planned: {found.problem}")
@@ -357,12 +377,21 @@ def _objections(found: CommandedForces) -> list[str]:
 
 
 def is_within(required: Array, allowed: Array) -> bool:
-    """Return True if forces (2,) [N] stay within limits (2,) [N], up to a share `BETTER`."""
+    """Return True if required forces (2,) [N] exceed allowed forces (2,) [N] by at most the
+    relative tolerance `BETTER`.
+    """
     return bool((required <= allowed * (1.0 + BETTER)).all())
 
 
 def _better(beside: Sequence[Alternative], timing: Timing, force: float) -> Iterator[str]:
-    """Yield a sentence for each compared path that is faster at the same force."""
+    """Yield a sentence for each alternative path that is faster than the recommended carry at the
+    same commanded force.
+
+    Args:
+        beside: alternative paths, compared with the recommended carry.
+        timing: timing of the recommended carry.
+        force: commanded force of the recommended carry [N].
+    """
     for other in beside:
         if other.duration_at_force < timing.duration * (1.0 - BETTER):
             yield (
@@ -413,12 +442,12 @@ class Alternative:
 def time_alternative(
     cell: Cell, label: str, path: Array, timing: Timing, force: float
 ) -> Alternative:
-    """Compare a path with a recommended carry at the same force, and in the same duration.
+    """Compare a path with the recommended carry, at its commanded force and in its duration.
 
     Args:
         cell: drivable cell.
         label: name of the path.
-        path: (n_path,) the path.
+        path: (n_path,) decision vector of the path, without a force limit.
         timing: timing of the recommended carry.
         force: commanded force of the recommended carry [N].
     """
@@ -439,15 +468,15 @@ def time_alternative(
 
 
 def level_force(workcell: Workcell, kind: ForceKind) -> float:
-    """Compute the normal force [N] that holds the payload level and at rest, the larger of both
-    robots.
+    """Compute the normal force [N] that holds the payload level and at rest, the larger of the two
+    robots' forces.
 
     Args:
         workcell: the cell.
-        kind: planned or robust force.
+        kind: kind of force to compute, planned or robust.
 
     Raises:
-        SettingsError: the uncertainty leaves no friction or patch.
+        SettingsError: the uncertainty leaves no friction or contact patch.
     """
     if not kind.robust:
         return float(static_hold(workcell).normal_force.max())
@@ -455,13 +484,13 @@ def level_force(workcell: Workcell, kind: ForceKind) -> float:
 
 
 def table_forces(workcell: Workcell) -> Array:
-    """Return the commanded forces (n,) [N] of the table of durations.
+    """Return the commanded forces (n,) [N] for which a table states the shortest durations.
 
-    These are multiples of the robust force that holds the payload level and at rest, and the
-    reference force.
+    They are multiples of the robust force that holds the payload level and at rest, followed by the
+    reference force of the force-controlled arm.
 
     Raises:
-        SettingsError: the uncertainty leaves no friction or patch.
+        SettingsError: the uncertainty leaves no friction or contact patch.
     """
     allowed = float(workcell.task.reference_force[1 - LEADER])
     forces = level_force(workcell, ROBUST_FORCE) * np.array(ABOVE_STILL)
@@ -469,13 +498,14 @@ def table_forces(workcell: Workcell) -> Array:
 
 
 def commanded_durations(paths: DrivenPaths, limits: Array | float, forces: Array) -> Array:
-    """Compute the shortest duration (n,) [s] of any path under each limit on the commanded force.
+    """Compute the shortest duration (n,) [s] of any of k paths within each of n limits on the
+    commanded force.
 
-    Jerk limits are left out. The duration is infinite if no path has a timing.
+    Limits on jerk are ignored. The duration is infinite if no path has a timing within the limit.
 
     Args:
-        paths: k paths.
-        limits: own force limit, one per path (k,) or one for all [N].
+        paths: the paths.
+        limits: force limit with which each path was found, (k,) or one for all paths [N].
         forces: (n,) limits on the commanded force [N].
     """
     if not len(paths):
@@ -493,7 +523,8 @@ def commanded_durations(paths: DrivenPaths, limits: Array | float, forces: Array
 
 
 def spread_rows(paths: Array) -> NDArray[np.intp]:
-    """Return indices of at most `MEMBERS` distinct rows of paths (k, n), evenly spread, first and
-    last included."""
+    """Return indices of at most `MEMBERS` distinct rows of an array (k, n_path) of paths; the
+    indices are evenly spread and include the first and the last distinct row.
+    """
     different = np.sort(np.unique(paths, axis=0, return_index=True)[1])
     return np.asarray(different[evenly(len(different), MEMBERS)])

@@ -54,11 +54,12 @@ LEAST_FRICTION = 0.02
 
 @dataclass(frozen=True)
 class Remedy:
-    """A change of the cell that brings the required forces within the allowed forces.
+    """One change of the cell with which the required normal forces stay within the reference
+    forces.
 
     Attributes:
-        change: text with the quantity and its new value.
-        share: relative change of the value.
+        change: changed quantity and its new value as text, such as 'a mass of 4.2 kg'.
+        share: new value over present value, minus one.
     """
 
     change: str
@@ -70,15 +71,17 @@ class Remedy:
 
 @dataclass(frozen=True)
 class Reserve:
-    """Largest payload and least friction with which the required forces stay within the reference
-    forces. Each is changed alone.
+    """Largest payload and least friction with which the required normal forces stay within the
+    reference forces.
 
-    The motion is unchanged. The forces hold it in every case of the uncertainty about the changed
-    value.
+    Payload and friction are changed one at a time, on an unchanged motion. The required forces hold
+    the box in every case of the uncertainty around the changed value.
 
     Attributes:
-        payload: largest payload mass [kg]; the inertia grows in proportion.
-        friction: least friction coefficient of the more slippery pad.
+        payload: largest mass of the payload [kg]; its inertia grows in proportion to the mass. NaN
+            if no mass suffices.
+        friction: least friction coefficient of the more slippery pad; the other pad's coefficient
+            changes by the same factor. NaN if no coefficient suffices.
     """
 
     payload: Figure
@@ -90,16 +93,16 @@ class Reserve:
 
 @dataclass(frozen=True)
 class GripBudget:
-    """Forces that hold the payload at rest in every case of the uncertainty, and the reference
-    forces.
+    """Normal forces that hold the payload at rest in every case of the uncertainty, compared with
+    the reference forces.
 
     Attributes:
-        required: (2,) larger normal force of each robot at the two ends of the path [N]; infinite
-            if no force holds every case.
-        allowed: (2,) reference forces [N].
-        uncertainty: the ranges of the cases.
-        remedies: smallest changes of the cell that bring the required forces within the allowed
-            forces; empty if they already are.
+        required: (2,) normal force that each robot needs [N], the larger of those at the start and
+            at the goal; infinite if no force holds every case.
+        allowed: (2,) reference force of each robot [N].
+        uncertainty: ranges of friction, mass and the other uncertain quantities.
+        remedies: smallest changes of the cell with which `required` stays within `allowed`; empty
+            if no change is necessary or none suffices.
     """
 
     required: Pair
@@ -109,7 +112,7 @@ class GripBudget:
 
     @property
     def fits(self) -> bool:
-        """Return True if both robots hold the payload within their reference forces."""
+        """Return True if each robot holds the payload at rest within its reference force."""
         return bool((self.required <= self.allowed * (1.0 + ROUNDING)).all())
 
     def __str__(self) -> str:
@@ -124,12 +127,16 @@ class GripBudget:
 
     @property
     def advice(self) -> str:
-        """The remedies as a sentence; '' if none are needed or known."""
+        """Sentence that lists the remedies as alternatives; '' if `remedies` is empty."""
         return remedies_text(self.remedies, "to hold it still; a motion takes more")
 
 
 def budget_text(workcell: Workcell) -> str:
-    """Format the budget of a cell for a terminal, with remedies if it is exceeded."""
+    """Describe the grip budget of a cell in one line for a terminal, with remedies if the required
+    force exceeds the reference force.
+
+    If the budget cannot be computed, the line states why.
+    """
     try:
         budget = grip_budget(workcell)
     except SettingsError as error:
@@ -140,19 +147,24 @@ def budget_text(workcell: Workcell) -> str:
 
 
 def remedies_text(remedies: tuple[Remedy, ...], purpose: str) -> str:
-    """Return the remedies as a sentence of alternatives; '' if there are none."""
+    """Return a sentence that lists remedies as alternatives; '' if there are none.
+
+    Args:
+        remedies: changes of the cell, each of which suffices alone.
+        purpose: end of the sentence 'any of these would do ...', such as 'to hold it still'.
+    """
     if not remedies:
         return ""
     return f"{', or '.join(map(str, remedies))}: any of these would do {purpose}"
 
 
 def grip_budget(workcell: Workcell) -> GripBudget:
-    """Compute the force that holds the payload at rest at both ends of its path. Nothing is
-    compiled.
+    """Compute the normal forces that hold the payload at rest at start and goal, and compare them
+    with the reference forces. Nothing is compiled.
 
     Raises:
-        SettingsError: some cases cannot be held by any force, or the uncertainty leaves no friction
-            or patch.
+        SettingsError: some cases of the uncertainty cannot be held by any force, or the uncertainty
+            leaves no friction or contact patch.
     """
     model, motion = interpreted_robust_model(workcell), _ends_at_rest(workcell)
     required, allowed = largest_forces(model, motion), workcell.task.reference_force
@@ -163,13 +175,19 @@ def grip_budget(workcell: Workcell) -> GripBudget:
 
 
 def required_at_rest(workcell: Workcell) -> Array:
-    """Compute the forces (2,) of `GripBudget.required`, without remedies [N]; errors as those of
-    `grip_budget`."""
+    """Compute the normal force (2,) [N] with which each robot holds the payload at rest at start
+    and goal in every case of the uncertainty: `GripBudget.required` without the search for
+    remedies.
+
+    Raises:
+        SettingsError: some cases of the uncertainty cannot be held by any force, or the uncertainty
+            leaves no friction or contact patch.
+    """
     return largest_forces(interpreted_robust_model(workcell), _ends_at_rest(workcell))
 
 
 def _ends_at_rest(workcell: Workcell) -> BoxMotion:
-    """Build the motion of a payload at rest at both ends of its path."""
+    """Build a motion of two samples: the payload at rest at the start and at the goal."""
     poses = np.array(
         [way.lower for way in (workcell.task.waypoints[0], workcell.task.waypoints[-1])]
     )
@@ -179,16 +197,17 @@ def _ends_at_rest(workcell: Workcell) -> BoxMotion:
 def largest_forces(
     model: RobustModel, motion: HeldMotion, rows: NDArray[np.intp] | None = None
 ) -> Array:
-    """Compute the largest robust force (2,) of each robot [N], in motion and at rest at the same
-    poses.
+    """Compute the largest robust normal force (2,) of each robot over a motion [N].
+
+    At each pose of the motion the box is held both moving and at rest.
 
     Args:
-        model: robust forces of the workcell.
-        motion: samples of the motion.
-        rows: indices of the worst cases to consider; None for all.
+        model: computes robust forces of the workcell.
+        motion: box poses and their time derivatives.
+        rows: indices of the rows of `RobustModel.worst_cases` to consider; None for all.
 
     Raises:
-        SettingsError: the uncertainty leaves no friction or patch.
+        SettingsError: the uncertainty leaves no friction or contact patch.
     """
     uncertainty, forces = model.workcell.uncertainty, np.zeros(2)
     for each in (motion, at_standstill(motion)):
@@ -204,13 +223,17 @@ def cheapest_remedies(
     allowed: Array,
     most: int = LISTED,
 ) -> tuple[Remedy, ...]:
-    """Find changes that bring the forces along a motion within the allowed forces: of the reference
-    forces, the mass, friction or the uncertainty, each alone.
+    """Find changes of the cell that bring the required forces along a motion within the reference
+    forces.
+
+    The reference forces, the mass, the friction and ranges of the uncertainty are changed, one of
+    them at a time.
 
     Args:
-        model: robust forces of the workcell.
-        motion: samples with the largest required forces.
-        required: (2,) largest force of each robot [N]; it may exceed the force at the samples.
+        model: computes robust forces of the workcell.
+        motion: samples of the motion at which the required forces are largest.
+        required: (2,) largest required normal force of each robot [N]; it may exceed the robust
+            force at the samples, for example because commanded forces are smoothed over time.
         allowed: (2,) reference force of each robot [N].
         most: largest number of remedies.
 
@@ -223,13 +246,13 @@ def cheapest_remedies(
 
 
 def reserve(model: RobustModel, motion: HeldMotion, required: Array, allowed: Array) -> Reserve:
-    """Compute the largest payload and the least friction with which the forces along a motion stay
-    within the allowed forces.
+    """Compute the largest payload, and the least friction, with which the required forces along a
+    motion stay within the reference forces.
 
     Args:
-        model: robust forces of the workcell.
-        motion: samples with the largest required forces.
-        required: (2,) largest force of each robot [N].
+        model: computes robust forces of the workcell.
+        motion: samples of the motion at which the required forces are largest.
+        required: (2,) largest required normal force of each robot [N].
         allowed: (2,) reference force of each robot [N].
 
     Returns:
@@ -244,8 +267,9 @@ def reserve(model: RobustModel, motion: HeldMotion, required: Array, allowed: Ar
 
 
 def _last_factor(excess: Callable[[float], float], near: float, far: float) -> float:
-    """Return the factor closest to `far` at which `excess` is not positive; NaN if it is positive
-    at `near`."""
+    """Return the factor between `near` and `far`, as close to `far` as possible, at which
+    `excess(factor)` is not positive; NaN if `excess(near)` is positive.
+    """
     if excess(near) > 0.0:
         return float("nan")
     if excess(far) <= 0.0:
@@ -257,8 +281,12 @@ def _last_factor(excess: Callable[[float], float], near: float, far: float) -> f
 def _excess(
     model: RobustModel, motion: HeldMotion, required: Array, allowed: Array
 ) -> Callable[[Workcell], float]:
-    """Return a function of a changed cell: the largest relative excess of its forces over the
-    allowed forces."""
+    """Return a function that maps a changed cell to the largest ratio of a required force to the
+    reference force, minus one.
+
+    The required forces of the changed cell are its robust forces along `motion`, scaled by the
+    ratio of `required` to the robust forces of the unchanged cell.
+    """
     known = largest_forces(model, motion)
     rows = model.governing_rows(motion, model.workcell.uncertainty, LEADER)
     # What a command holds beyond its motion, as by smoothing, stays in proportion.
@@ -298,7 +326,9 @@ def _stronger(required: Array, allowed: Array) -> Iterator[Remedy]:
 
 
 def _of_cell(workcell: Workcell, excess: Callable[[Workcell], float]) -> Iterator[Remedy]:
-    """Yield the changes of mass, friction and uncertainty that bring the excess to zero."""
+    """Yield the smallest change of the mass, of the friction and of ranges of the uncertainty at
+    which `excess`, a function from `_excess`, is zero for the changed cell.
+    """
     payload, contacts, uncertainty = workcell.payload, workcell.contacts, workcell.uncertainty
 
     lighter = _smallest_change(lambda factor: excess(_with_mass(workcell, factor)), LEAST_MASS)
@@ -334,8 +364,9 @@ def _of_cell(workcell: Workcell, excess: Callable[[Workcell], float]) -> Iterato
 
 
 def _smallest_change(excess: Callable[[float], float], far: float) -> float | None:
-    """Return the factor closest to one at which `excess` is not positive; None if it is positive at
-    `far`."""
+    """Return the factor between one and `far`, as close to one as possible, at which
+    `excess(factor)` is not positive; None if `excess(far)` is positive.
+    """
     if excess(far) > 0.0:
         return None
     root = float(brentq(excess, 1.0, far, xtol=PRECISION))

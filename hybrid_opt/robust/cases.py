@@ -37,7 +37,11 @@ LEADER, FOLLOWER = 0, 1
 
 
 def nominal_case(workcell: Workcell) -> Array:
-    """Return the nominal case (18,) of the workcell, laid out by `worst_cases.CASE_SIZES`."""
+    """Return the nominal case (18,) of the workcell: friction, patches and payload as described,
+    nothing displaced or disturbed.
+
+    The entries are laid out by `symbolic.contact.worst_cases.CASE_SIZES`.
+    """
     contacts, payload = workcell.contacts, workcell.payload
     return np.concatenate(
         [
@@ -51,12 +55,16 @@ def nominal_case(workcell: Workcell) -> Array:
 
 
 def worst_cases(contact: ContactModel, uncertainty: Uncertainty, leader: int = 0) -> Array:
-    """Return worst cases (k, 18) of an uncertainty: the largest squeeze among them suffices for
-    every case within the ranges.
+    """Return the worst cases (k, 18) of an uncertainty: the largest squeeze that any of them needs
+    holds the box in every case within the ranges.
+
+    Each row states true values of friction, mass and the other uncertain quantities, laid out by
+    `symbolic.contact.worst_cases.CASE_SIZES`.
 
     Args:
         contact: contact model of the workcell's commanded forces.
-        leader: index of the robot whose force is not commanded.
+        uncertainty: ranges of the uncertain quantities.
+        leader: index of the position-controlled robot, whose force is not commanded.
     """
     case = nominal_case(contact.workcell)
     case[0:2] = contact.least_friction(uncertainty)
@@ -78,8 +86,16 @@ def worst_cases(contact: ContactModel, uncertainty: Uncertainty, leader: int = 0
 def random_cases(
     workcell: Workcell, uncertainty: Uncertainty, n: int, rng: np.random.Generator, leader: int = 0
 ) -> Array:
-    """Draw n random cases (n, 18), uniform in the ranges of the uncertainty and in the discs of pad
-    positions."""
+    """Draw n random cases (n, 18), uniformly distributed in the ranges of the uncertainty and in
+    the discs of pad positions.
+
+    Args:
+        workcell: the cell with the nominal values.
+        uncertainty: ranges of the uncertain quantities.
+        n: number of cases.
+        rng: random generator.
+        leader: index of the position-controlled robot, whose force is not commanded.
+    """
     cases = np.tile(nominal_case(workcell), (n, 1))
     cases[:, 0:2] *= 1.0 + uncertainty.friction * rng.uniform(-1.0, 1.0, (n, 2))
     cases[:, 4] *= 1.0 + uncertainty.mass * rng.uniform(-1.0, 1.0, n)
@@ -96,7 +112,9 @@ def random_cases(
 
 
 def _in_discs(rng: np.random.Generator, radius: float, n: int, discs: int) -> Array:
-    """Draw points (n, discs, 2) uniformly from discs of a radius [m]."""
+    """Draw points (n, discs, 2) [m], uniformly distributed in discs of a radius [m] about the
+    origin.
+    """
     angle = rng.uniform(0.0, 2.0 * np.pi, (n, discs))
     reach = radius * np.sqrt(rng.random((n, discs)))
     return np.stack([reach * np.cos(angle), reach * np.sin(angle)], axis=2)
@@ -104,15 +122,18 @@ def _in_discs(rng: np.random.Generator, radius: float, n: int, discs: int) -> Ar
 
 @dataclass(frozen=True)
 class GoverningCases:
-    """Worst cases that decide the forces at n samples.
+    """Worst cases that decide the normal forces at n samples of a motion.
+
+    Cases are indices of rows of `worst_cases`. The leading arm is position controlled, the other
+    arm is force controlled.
 
     Attributes:
-        leader: index of the arm that keeps its place.
-        force: (n, 2) force of each robot [N]: the commanded force of the force-controlled arm, and
-            the largest resulting force of the leading arm.
-        commanded: (n,) index of the case that decides the commanded force.
-        leading: (n,) index of the case with the largest excess of the leading arm's force over the
-            commanded force.
+        leader: index of the leading arm.
+        force: (n, 2) normal force of each robot [N]: the commanded force of the force-controlled
+            arm, and the largest force of the leading arm that results from it in any case.
+        commanded: (n,) index of the case that needs the largest commanded force.
+        leading: (n,) index of the case in which the leading arm's force exceeds the commanded force
+            most.
         share: (n,) share of this excess that acts on the leading arm, from `transmitted_share`.
         leading_share: rise of the leading arm's force per newton of commanded force.
     """
@@ -131,11 +152,14 @@ class GoverningCases:
         return GoverningCases(self.leader, *found, self.leading_share)
 
     def slopes(self, commanded: Array, leading: Array) -> Array:
-        """Compute the derivatives (n, 2, m) of `force` by m inputs.
+        """Compute the derivatives (n, 2, m) of `force` with respect to m inputs, such as the box
+        pose.
 
         Args:
-            commanded, leading: (n, 2, m) derivatives of both robots' forces in the cases
-                `commanded` and `leading`.
+            commanded: (n, 2, m) derivatives of both robots' least forces in the case
+                `self.commanded` of each sample.
+            leading: (n, 2, m) derivatives of both robots' least forces in the case `self.leading`
+                of each sample.
         """
         follower, share = 1 - self.leader, self.leading_share
         found = np.empty_like(commanded)
@@ -146,12 +170,19 @@ class GoverningCases:
 
 
 def transmitted_share(difference: Array, uncertainty: Uncertainty) -> Array:
-    """Compute the share of the force difference that acts on the leading arm, in the case of the
-    mass for which the leading arm's force is largest.
+    """Compute which share of the difference of both normal forces acts on the leading arm, for the
+    payload mass that loads this arm most.
 
-    The difference is leading minus commanded force, under the largest mass. A positive difference
-    acts in full. A negative one is smallest in size for the least mass; then (1 - m) / (1 + m) of
-    it acts, m being the uncertainty of the mass.
+    A positive difference is largest for the largest mass, and acts in full: the share is 1. A
+    negative difference is smallest in size for the least mass: the share is (1 - s) / (1 + s) with
+    s the relative uncertainty of the mass.
+
+    Args:
+        difference: leading minus commanded normal force for the largest mass [N], of any shape.
+        uncertainty: ranges of the uncertain quantities.
+
+    Returns:
+        Share between 0 and 1, in the shape of `difference`.
     """
     lightest = (1.0 - uncertainty.mass) / (1.0 + uncertainty.mass)
     return np.where(difference > 0.0, 1.0, lightest)
@@ -164,16 +195,17 @@ def governing_cases(
     difference: Array | None = None,
     leading_share: float = 1.0,
 ) -> GoverningCases:
-    """Find the worst cases that decide the forces.
+    """Find the worst cases that decide the normal forces at n samples.
 
-    The motion fixes the difference of both forces; it is independent of the squeeze and
-    proportional to the mass.
+    The motion fixes the difference of both robots' normal forces. This difference does not depend
+    on the squeeze, and is proportional to the mass.
 
     Args:
-        worst: (k, n, 2) least normal forces of k cases at n samples [N].
-        uncertainty: the ranges of the cases.
-        leader: index of the arm that keeps its place.
-        difference: (k, n) leading minus commanded force [N]; the difference in `worst` if None.
+        worst: (k, n, 2) least normal forces of both robots in k cases at n samples [N].
+        uncertainty: ranges of the uncertain quantities.
+        leader: index of the position-controlled arm.
+        difference: (k, n) leading force minus `leading_share` times commanded force [N]; None to
+            take it from `worst`.
         leading_share: rise of the leading arm's force per newton of commanded force.
     """
     follower, every = 1 - leader, np.arange(worst.shape[1])

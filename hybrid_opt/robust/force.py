@@ -78,14 +78,19 @@ forces."""
 
 @dataclass(frozen=True)
 class BoxMotion:
-    """Box poses (n, 6) and their first and second time derivatives at n samples."""
+    """Box poses and their time derivatives at n samples, world frame.
+
+    Attributes:
+        pose: (n, 6) box poses [m, rad].
+        rate, second_rate: (n, 6) first and second time derivative of the pose.
+    """
 
     pose: Array
     rate: Array
     second_rate: Array
 
     def at(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> BoxMotion:
-        """Return the motion at the samples with these indices, or at the marked samples."""
+        """Return the motion at some samples, given by indices or by a mask (n,)."""
         return BoxMotion(self.pose[rows], self.rate[rows], self.second_rate[rows])
 
 
@@ -94,12 +99,16 @@ HeldMotion = BoxMotion | Carry
 
 
 def motion_inputs(motion: HeldMotion) -> tuple[Array, Array, Array]:
-    """Return pose, rate and second rate (n, 6) of a motion, the inputs of the force functions."""
+    """Return pose, first and second time derivative (n, 6) of the box along a motion, the inputs of
+    the compiled force functions.
+    """
     return motion.pose, motion.rate, motion.second_rate
 
 
 def box_motion(motion: HeldMotion) -> BoxMotion:
-    """Return a motion as a `BoxMotion`, without everything else that a carry holds."""
+    """Return the box poses of a motion and their time derivatives, without the other quantities of
+    a carry.
+    """
     return BoxMotion(*motion_inputs(motion))
 
 
@@ -109,12 +118,14 @@ def tile_motion(motion: HeldMotion, times: int) -> BoxMotion:
 
 
 def at_rest() -> BoxMotion:
-    """Return a motion of one sample: the box level and at rest."""
+    """Return a motion of one sample: the box at rest in the world's origin, with its axes along the
+    world's.
+    """
     return BoxMotion(*[np.zeros((1, 6))] * 3)
 
 
 def at_standstill(motion: HeldMotion) -> BoxMotion:
-    """Return the motion with the same poses and zero rates."""
+    """Return a motion with the same box poses, whose time derivatives are zero."""
     return BoxMotion(motion.pose, 0.0 * motion.rate, 0.0 * motion.second_rate)
 
 
@@ -123,11 +134,11 @@ class RobustForce:
     """Normal forces at n samples that hold the box in every case of an uncertainty.
 
     Attributes:
-        leader: index of the arm that keeps its place.
-        uncertainty: the ranges of the cases.
-        nominal: (n, 2) least normal forces for the nominal case [N].
+        leader: index of the position-controlled arm.
+        uncertainty: ranges of the uncertain quantities.
+        nominal: (n, 2) least normal force of each robot if nothing is uncertain [N].
         commanded: (n,) normal force of the force-controlled arm [N].
-        leading: (n,) largest normal force of the leading arm in any case [N].
+        leading: (n,) largest normal force of the position-controlled arm in any case [N].
     """
 
     leader: int
@@ -146,12 +157,13 @@ class RobustForce:
 
 @dataclass(frozen=True)
 class SampledCheck:
-    """Check of commanded forces in random cases.
+    """Result of a check of commanded forces in random cases of an uncertainty.
 
     Attributes:
-        cases: number of cases, each checked at all samples of the carry.
+        cases: number of random cases, each checked at all samples of the carry.
         failing: number of cases that need more than the commanded force at some sample.
-        closest: largest share of the commanded force that any case needs, at least `SCREENED`.
+        closest: largest ratio, over cases and samples, of the force that a case needs to the
+            commanded force; smaller ratios than `SCREENED` are stated as `SCREENED`.
     """
 
     cases: Count
@@ -160,20 +172,22 @@ class SampledCheck:
 
     @property
     def holds(self) -> bool:
-        """True if the commanded forces hold every case."""
+        """True if the commanded forces hold the box in every checked case."""
         return self.failing == 0
 
     @property
     def hardest(self) -> str:
-        """Text that states `closest`."""
+        """Text that states the ratio `closest`."""
         most = "at most " if self.closest == SCREENED else ""
         return f"{most}{100.0 * self.closest:.2f} %"
 
 
 class RobustModel:
-    """Robust forces of one workcell's carries, from compiled functions.
+    """Computes the normal forces that hold a workcell's box in every case of an uncertainty.
 
-    The argument `leader` is always the index of the position-controlled arm.
+    A case is a row (18,) of true values of friction, mass and the other uncertain quantities, laid
+    out by `symbolic.contact.worst_cases.CASE_SIZES`. The argument `leader` is always the index of
+    the position-controlled arm; the force of the other arm is commanded.
 
     Attributes:
         workcell: the cell.
@@ -216,7 +230,9 @@ class RobustModel:
         return other
 
     def _describe(self, workcell: Workcell) -> None:
-        """Take what the cases of a workcell are made from."""
+        """Store the workcell, its contact model and its nominal case, and forget the cached worst
+        cases.
+        """
         self.workcell, self._contact = workcell, command_model(workcell)
         self._nominal = nominal_case(workcell)[None]
         self._worst: dict[tuple[int, int], tuple[Uncertainty, Array]] = {}
@@ -236,7 +252,7 @@ class RobustModel:
         """Return the worst cases (k, 18) of an uncertainty, read-only.
 
         Raises:
-            SettingsError: the uncertainty leaves no friction or patch.
+            SettingsError: the uncertainty leaves no friction or contact patch.
         """
         key = id(uncertainty), leader
         if key not in self._worst:
@@ -256,12 +272,14 @@ class RobustModel:
     def least(
         self, motion: HeldMotion, cases: Array, leader: int, threads: int, displaced: bool
     ) -> Array:
-        """Compute the least normal forces (m, 2) of both robots that hold each sample's case [N].
+        """Compute the least normal forces (m, 2) [N] with which both robots hold one case per
+        sample.
 
-        The leading arm's force results from the commanded force of the other arm.
+        The force of the leading arm is the one that results from the commanded force of the other
+        arm.
 
         Args:
-            motion: motion at m samples.
+            motion: box motion at m samples.
             cases: (m, 18) one case per sample.
             leader: index of the leading arm.
             threads: number of threads, 0 for one per core.
@@ -273,19 +291,31 @@ class RobustModel:
     def slack(
         self, motion: HeldMotion, cases: Array, force: Array, leader: int, threads: int = 1
     ) -> Array:
-        """Compute the slack (m,) of one case per sample under commanded forces (m,) [N], by
-        `case_slack_function`. A positive slack proves that the force holds the case; a negative
-        slack proves nothing."""
+        """Test by `case_slack_function` whether commanded forces hold one case per sample.
+
+        Args:
+            motion: box motion at m samples.
+            cases: (m, 18) one case per sample.
+            force: (m,) commanded normal forces [N].
+            leader: index of the leading arm.
+            threads: number of threads, 0 for one per core.
+
+        Returns:
+            Slack (m,). A positive slack proves that the force holds the case; a negative slack
+                proves nothing.
+        """
         given = *motion_inputs(motion), cases, force
         return self._slack(1 - leader).batch(*given, threads=threads)["slack"].ravel()
 
     def least_squeeze(self, motion: HeldMotion, cases: Array, leader: int = 0) -> Array:
-        """Compute the least normal forces (k, n, 2) of both robots [N] for k cases at n samples.
+        """Compute the least normal forces (k, n, 2) [N] with which both robots hold k cases at n
+        samples.
 
         Args:
-            motion: motion at n samples.
-            cases: (k, 18) the cases.
-            leader: index of the leading arm; its force results from the other, commanded one.
+            motion: box motion at n samples.
+            cases: (k, 18) cases, each applied to all samples.
+            leader: index of the leading arm; its force results from the commanded force of the
+                other arm.
         """
         displaced = bool(cases[:, 11:15].any())
         n = len(motion.pose)
@@ -299,13 +329,16 @@ class RobustModel:
         return found
 
     def nominal(self, motion: HeldMotion, leader: int = 0) -> Array:
-        """Compute the least normal forces (n, 2) of both robots that hold the nominal case [N]."""
+        """Compute the least normal forces (n, 2) [N] with which both robots hold the box at n
+        samples if nothing is uncertain.
+        """
         return np.asarray(self.least_squeeze(motion, self._nominal, leader)[0])
 
     @cached_property
     def leading_share(self) -> Array:
-        """Rise of the leading arm's force per newton of commanded force, for either arm leading
-        (2,)."""
+        """(2,) rise of the leading arm's force per newton of commanded force: entry i if arm i
+        leads.
+        """
         return self._contact.leading_share
 
     def hold(
@@ -315,20 +348,21 @@ class RobustModel:
         leader: int = 0,
         rows: NDArray[np.intp] | None = None,
     ) -> tuple[Array, Array]:
-        """Compute the least commanded normal force (n,) that holds every case of an uncertainty
-        [N].
-
-        Also return the largest resulting normal force (n,) of the leading arm [N]. Both are
-        infinite where no force holds every case.
+        """Compute the least commanded force that holds every case of an uncertainty, and the force
+        of the leading arm that results from it.
 
         Args:
-            motion: motion at n samples.
-            uncertainty: the ranges of the cases.
+            motion: box motion at n samples.
+            uncertainty: ranges of the uncertain quantities.
             leader: index of the leading arm.
-            rows: indices of the worst cases to consider; None for all.
+            rows: indices of the rows of `worst_cases` to consider; None for all.
+
+        Returns:
+            Commanded normal force (n,) [N], and the largest normal force (n,) of the leading arm in
+                any case [N]. Both are infinite at samples where no force holds every case.
 
         Raises:
-            SettingsError: the uncertainty leaves no friction or patch.
+            SettingsError: the uncertainty leaves no friction or contact patch.
         """
         cases = self.worst_cases(uncertainty, leader)
         worst = self.least_squeeze(motion, cases if rows is None else cases[rows], leader)
@@ -340,9 +374,11 @@ class RobustModel:
     def governing_rows(
         self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0
     ) -> NDArray[np.intp]:
-        """Return the indices of the worst cases that need the largest forces at any sample:
-        `GOVERNING_CASES` cases by the commanded force, and as many by the excess of the leading
-        arm's force."""
+        """Return indices of the rows of `worst_cases` that need the largest forces at any sample.
+
+        For each sample these are `GOVERNING_CASES` cases with the largest commanded forces, and as
+        many in which the leading arm's force exceeds the commanded force most.
+        """
         worst = self.least_squeeze(motion, self.worst_cases(uncertainty, leader), leader)
         command = worst[:, :, 1 - leader]
         beyond = worst[:, :, leader] - float(self.leading_share[leader]) * command
@@ -355,14 +391,18 @@ class RobustModel:
         leader: int = 0,
         above: Array | float = 0.0,
     ) -> Array:
-        """Compute the least commanded force (n,) that holds every case [N], faster than `hold`.
+        """Compute the least commanded normal force (n,) [N] that holds every case, faster than
+        `hold`; infinite where none does.
 
-        At a few samples `slack` finds the cases with the largest forces, which are then computed.
-        `slack` proves that most other cases need no more. At most `SAMPLES` samples are checked in
-        all cases, the others only in the cases that govern at these samples.
+        At a few samples `slack` finds the cases with the largest forces, and the forces of these
+        cases are computed. `slack` proves that most other cases need no more. At most `SAMPLES`
+        samples are checked in all cases, the others only in the cases that govern at these samples.
 
         Args:
-            above: (n,) lower bound of the result, or one for all samples [N].
+            motion: box motion at n samples.
+            uncertainty: ranges of the uncertain quantities.
+            leader: index of the leading arm.
+            above: lower bound of the result, one per sample (n,) or one for all samples [N].
         """
         cases, n = self.worst_cases(uncertainty, leader), len(motion.pose)
         few = evenly(n, SCREENING_SAMPLES)
@@ -391,8 +431,8 @@ class RobustModel:
     def peak(self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0) -> Array:
         """Compute the largest normal force (2,) of each robot over a motion in any case [N].
 
-        The forces are those of `hold`, computed only at the few samples that can attain the
-        largest.
+        The result is the maximum of the forces of `hold`, which are computed only at the few
+        samples where the maximum can lie.
         """
         force, planned = self.commanded(motion, uncertainty, leader), self.nominal(motion, leader)
         share = self.leading_share[leader]
@@ -433,13 +473,13 @@ class RobustModel:
         rng: np.random.Generator,
         threads: int = 1,
     ) -> SampledCheck:
-        """Check commanded forces in n random cases of their uncertainty, at every sample.
+        """Check commanded forces in random cases of their uncertainty, at every sample of a motion.
 
         Args:
-            motion: motion that the forces belong to.
+            motion: box motion for which the forces were computed.
             force: the commanded forces with their uncertainty.
-            n: number of cases.
-            rng: generator of the cases.
+            n: number of random cases.
+            rng: random generator that draws the cases.
             threads: number of threads, 0 for one per core. The result does not depend on it.
         """
         failing, closest, left = 0, SCREENED, n
@@ -466,8 +506,9 @@ class RobustModel:
         leader: int,
         threads: int = 1,
     ) -> Array:
-        """Compute the share (k, n) of the commanded forces (n,) that each of k cases needs. Shares
-        below `screened` are returned as `screened`."""
+        """Compute the ratio (k, n) of the force that each of k cases needs at n samples to the
+        commanded force (n,). Ratios below `screened` are returned as `screened`.
+        """
         n, k = len(motion.pose), len(cases)
         displaced = bool(cases[:, 11:15].any())
         level = screened * (self._friction_left(cases) if displaced and self._one else 1.0)
@@ -481,15 +522,26 @@ class RobustModel:
         return share.reshape(k, n)
 
     def _friction_left(self, cases: Array) -> float:
-        """Compute the least share of friction that displaced pads leave. `slack` does not know
-        displacements."""
+        """Compute the least share of the friction coefficient that remains in cases (k, 18) with
+        displaced pads, less a reserve. It scales forces for `slack`, which ignores displacements.
+        """
         apart = np.linalg.norm(cases[:, 11:13] - cases[:, 13:15], axis=1)
         lost = self._contact.friction_lost(apart) / cases[:, :2].min(axis=1)
         return SCREEN_SHARE * max(0.0, 1.0 - float(lost.max()))
 
     def largest_factor(self, motion: HeldMotion, limit: Array, leader: int = 0) -> float:
-        """Find the largest multiple of the workcell's uncertainty for which the forces stay within
-        limits (2,) [N], at most `LARGEST_FACTOR`; zero if the nominal forces exceed the limits."""
+        """Find the largest factor on the workcell's uncertainty with which the forces of `peak`
+        stay within limits.
+
+        Args:
+            motion: box motion.
+            limit: (2,) largest allowed normal force of each robot [N].
+            leader: index of the leading arm.
+
+        Returns:
+            Factor from 0 to `LARGEST_FACTOR`; 0 if the forces without uncertainty exceed the
+                limits.
+        """
         chosen = self.workcell.uncertainty
         end = allowed_factor(self.workcell, chosen)
 
@@ -502,8 +554,9 @@ class RobustModel:
 
 
 def allowed_factor(workcell: Workcell, uncertainty: Uncertainty) -> float:
-    """Find the largest multiple of an uncertainty that leaves some friction and patch, at most
-    `LARGEST_FACTOR`."""
+    """Find the largest factor on the ranges of an uncertainty that leaves some friction and contact
+    patch, at most `LARGEST_FACTOR`.
+    """
     low, high, contact = 0.0, LARGEST_FACTOR, command_model(workcell)
     if _has_positive_remainders(contact, uncertainty.scaled(high)):
         return high
@@ -515,7 +568,9 @@ def allowed_factor(workcell: Workcell, uncertainty: Uncertainty) -> float:
 
 
 def _has_positive_remainders(contact: ContactModel, uncertainty: Uncertainty) -> bool:
-    """Return True if friction, patches, mass and force are positive in the worst case."""
+    """Return True if friction coefficients, contact patches, mass and transmitted force remain
+    positive at the worst ends of the ranges.
+    """
     shares = [1.0 - uncertainty.mass, 1.0 - uncertainty.tracking]
     left = [*contact.least_friction(uncertainty), contact.displacement_margin(uncertainty), *shares]
     return bool(min(left) > 0.0)
@@ -527,8 +582,9 @@ model."""
 
 
 def interpreted_robust_model(workcell: Workcell) -> RobustModel:
-    """Return the robust model of a workcell with interpreted functions, for few samples: nothing is
-    compiled."""
+    """Return a robust model whose functions CasADi interprets: nothing is compiled, which suits a
+    few samples.
+    """
     # Not imported at the top: what is compiled already needs no CasADi.
     from codegen.interpreted import interpret
 
@@ -542,16 +598,15 @@ def interpreted_robust_model(workcell: Workcell) -> RobustModel:
 
 @dataclass(frozen=True)
 class RobustPrice:
-    """The price of robustness of one carry.
+    """Price of robustness: the normal forces of one carry, against the size of the uncertainty.
 
     Attributes:
         uncertainty: the workcell's uncertainty.
-        factors: (k,) multiples of the uncertainty for which a force was found.
-        peak: (k, 2) largest normal force of each robot for each multiple [N].
-        commanded: (2,) largest normal force of each robot for the uncertainty itself [N].
-        limit: (2,) reference forces [N].
-        largest_factor: largest multiple of the uncertainty for which the forces stay within the
-            reference forces.
+        factors: (k,) factors on the uncertainty for which a holding force was found.
+        peak: (k, 2) largest normal force of each robot along the carry for each factor [N].
+        commanded: (2,) largest normal force of each robot for the factor 1 [N].
+        limit: (2,) reference force of each robot [N].
+        largest_factor: largest factor for which the forces stay within the reference forces.
         check: check of the commanded forces in random cases of the uncertainty.
     """
 
@@ -573,19 +628,19 @@ def robust_price(
     threads: int = 1,
     points: int = POINTS,
 ) -> RobustPrice:
-    """Compute the price of robustness of a carry against the workcell's uncertainty.
+    """Compute the price of robustness of a carry: its forces against the size of the uncertainty.
 
     Args:
-        model: robust forces of the carry's workcell.
+        model: computes robust forces of the carry's workcell.
         carry: the carry.
-        rng: generator of the random cases.
-        leader: index of the arm that keeps its place.
+        rng: random generator that draws the cases of the check.
+        leader: index of the position-controlled arm.
         cases: number of random cases.
         threads: number of threads, 0 for one per core.
-        points: number of multiples of the uncertainty.
+        points: number of factors on the uncertainty.
 
     Raises:
-        SettingsError: the uncertainty leaves no friction or patch.
+        SettingsError: the uncertainty leaves no friction or contact patch.
     """
     workcell = model.workcell
     uncertainty = workcell.uncertainty
@@ -607,7 +662,7 @@ def robust_price(
 
 
 def subsample(carry: Carry) -> tuple[NDArray[np.intp], BoxMotion]:
-    """Return row indices and motion of some samples of a carry.
+    """Return the indices of some samples of a carry, and the box motion at these samples.
 
     The samples are `SAMPLES` evenly spread ones and, for each robot, the one with its largest
     normal force.

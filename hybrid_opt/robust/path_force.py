@@ -1,8 +1,9 @@
 """Robust forces at points of a path as functions of u'' and u'^2, with derivatives.
 
-In every case the least squeeze is convex in the required force and moment, which are affine in
-(u'', u'^2). So the largest squeeze over the worst cases is convex too; its slope is the slope of
-the governing case.
+u is the path parameter; u' and u'' are its time derivatives. In every case of the uncertainty the
+least squeeze is convex in the required force and moment, which are affine in (u'', u'^2). So the
+largest squeeze over the worst cases is convex too; its slope is the slope of the case that needs
+the largest squeeze, called governing.
 """
 
 from __future__ import annotations
@@ -53,11 +54,13 @@ BELOW = -np.inf
 
 @dataclass(frozen=True)
 class PathPoints:
-    """n points of paths with path acceleration and squared path speed.
+    """n points of paths, with the path acceleration and the squared path speed at each point.
 
     Attributes:
-        pose, first, second: (n, 6) box poses and their derivatives by u.
-        a, w: (n,) u'' and u'^2.
+        pose, first, second: (n, 6) box poses [m, rad], and their first and second derivative with
+            respect to the path parameter u.
+        a: (n,) path acceleration u'' [1/s^2].
+        w: (n,) squared path speed u'^2 [1/s^2].
     """
 
     pose: Array
@@ -75,7 +78,9 @@ class PathPoints:
 
     @property
     def driven(self) -> tuple[Array, ...]:
-        """Arrays of the points in the order in which `case_slopes_function` takes them."""
+        """Arrays pose, first, second, a and w, in the order in which `case_slopes_function` takes
+        them.
+        """
         return self.pose, self.first, self.second, self.a, self.w
 
     @property
@@ -87,7 +92,10 @@ class PathPoints:
 
 
 class RobustPath:
-    """Robust forces along paths of one workcell, from compiled functions."""
+    """Computes robust normal forces at points of a workcell's paths, with their derivatives.
+
+    Arm `LEADER` is position controlled, the other arm is force controlled.
+    """
 
     def __init__(self, workcell: Workcell) -> None:
         """Load or build the compiled functions.
@@ -109,11 +117,16 @@ class RobustPath:
         self._excess = contact_function(workcell, "case excess", case_excess_function, lanes=0)
 
     def at(self, points: PathPoints) -> tuple[Array, Array]:
-        """Compute the least normal forces that hold in every case of the workcell's uncertainty.
+        """Compute the least normal forces that hold the box in every case of the workcell's
+        uncertainty.
+
+        Args:
+            points: n points of paths.
 
         Returns:
-            Forces (n, 2) of both robots [N], and slopes (n, 2, 20): derivatives by pose (6), its
-            first and second derivative by u (12), u'' and u'^2.
+            Normal forces (n, 2) of both robots [N], and their slopes (n, 2, 20): derivatives with
+                respect to the pose (6), to its first and second derivative by u (12), to u'' and to
+                u'^2.
         """
         least = self._model.least_squeeze(points.motion, self._cases, LEADER)
         governing = governing_cases(least, self._set, LEADER, leading_share=self._share)
@@ -122,13 +135,17 @@ class RobustPath:
     def governing_above(
         self, points: PathPoints, level: Array
     ) -> tuple[NDArray[np.intp], GoverningCases]:
-        """Find the points at which the force of either robot exceeds a level (n,) [N].
+        """Find the points at which the robust normal force of either robot exceeds a level.
 
-        `RobustModel.slack` proves that most cases need less. Slopes are left to `slopes`: for all
-        points they would take as long as the forces.
+        `RobustModel.slack` proves that most cases need less; only the forces of the remaining cases
+        are computed. Call `slopes` with the result for the derivatives.
+
+        Args:
+            points: n points of paths.
+            level: (n,) normal force at each point [N].
 
         Returns:
-            Indices of the points, and their governing cases.
+            Indices of the points found, and the governing cases at these points.
         """
         n, k = len(points), len(self._cases)
         every, cases = tile_motion(points.motion, k), np.repeat(self._cases, n, axis=0)
@@ -150,13 +167,14 @@ class RobustPath:
 
     def most_demanding(self, points: PathPoints, count: int) -> tuple[Array, Array]:
         """Compute forces and slopes of the `count` cases with the largest commanded forces at each
-        point.
+        of n points.
 
-        Several cases matter to a polish, because each governing case has its own slope.
+        A polish needs several cases, because the governing case changes along with the path, and
+        with it the slope.
 
         Returns:
-            Forces (n, 2, count) of both robots [N], the largest first, and their slopes (n, 2,
-            count, 20).
+            Normal forces (n, 2, count) of both robots [N], the largest commanded force first, and
+                their slopes (n, 2, count, 20) as in `at`.
         """
         n, least = len(points), self._model.least_squeeze(points.motion, self._cases, LEADER)
         governing = governing_cases(least, self._set, LEADER, leading_share=self._share)
@@ -171,7 +189,9 @@ class RobustPath:
         return force, slope
 
     def slopes(self, points: PathPoints, governing: GoverningCases) -> Array:
-        """Compute the slopes (n, 2, 20) of the forces in the governing cases."""
+        """Compute the slopes (n, 2, 20) of both robots' normal forces in the governing cases at n
+        points; the columns are those of `at`.
+        """
         if not len(points):
             return np.zeros((0, 2, BY_TIMING.stop))
         cases = np.concatenate([self._cases[governing.commanded], self._cases[governing.leading]])
@@ -199,26 +219,31 @@ SMOOTH = 1e-2
 
 
 class GoverningForce:
-    """The largest commanded force along a carry that holds in every case of the workcell's
-    uncertainty, with its derivatives.
+    """Largest commanded normal force along a carry that holds the box in every case of the
+    workcell's uncertainty, with its derivatives.
 
-    Its derivative is the derivative in the governing case (Danskin's theorem): by the motion, the
-    case and the cell's parameters; for pads without opposite normals, by the load. If several cases
-    govern, the directional derivative is the largest of their derivatives.
+    A case of the uncertainty governs if it needs this force at some sample. The derivative of the
+    force is the derivative in the governing case (Danskin's theorem); if several cases govern, the
+    directional derivative is the largest of their derivatives. For pads with opposite normals the
+    inputs are the motion, the case and the cell's parameters; for other pads, the motion, the case
+    and the load.
 
     Attributes:
         force: the force [N].
-        samples: (k,) samples of the carry that need this force, one per governing case.
+        samples: (k,) indices of the samples of the carry that need this force, one per governing
+            case.
     """
 
     def __init__(self, carry: Carry, leader: int) -> None:
-        """Find the governing cases.
+        """Find the governing cases of a carry.
 
         Args:
-            leader: index of the arm whose force is not commanded.
+            carry: the carry.
+            leader: index of the position-controlled arm, whose force is not commanded.
 
         Raises:
-            SettingsError: no force holds every case of the uncertainty.
+            SettingsError: some cases cannot be held by any force, or the uncertainty leaves no
+                friction or contact patch.
         """
         model = robust_model(carry.workcell)
         self._workcell, self._leader = model.workcell, leader
@@ -236,16 +261,17 @@ class GoverningForce:
     def slopes(
         self, low: Workcell, high: Workcell, motions: tuple[BoxMotion, BoxMotion], pads: bool
     ) -> tuple[float, float]:
-        """Compute the changes of the force [N] if the cell changes a little in either direction.
+        """Compute how much the force changes [N] between this cell and two neighbouring cells.
 
         Args:
-            low, high: two changed cells, equally far from this one to either side.
-            motions: motions of the lower and of the higher cell at `samples`.
-            pads: whether the pads of the cells differ. Forces of pads without opposite normals are
-                then computed anew.
+            low, high: cells in which one number is lower, and higher by the same amount, than in
+                this cell.
+            motions: box motions in the cell `low` and in the cell `high`, at `samples`.
+            pads: True if the two cells' pads differ. Then the forces of pads without opposite
+                normals are computed anew.
 
         Returns:
-            Change towards the higher and change towards the lower cell.
+            Change of the force towards `high`, and change towards `low`.
         """
         before, after = (
             self._inputs(cell, at, pads) for cell, at in zip((low, high), motions, strict=True)
@@ -263,8 +289,12 @@ class GoverningForce:
         return self._inputs(self._workcell, self._motion, pads=True)
 
     def _inputs(self, cell: Workcell, motion: BoxMotion, pads: bool) -> Array:
-        """Compute the inputs (k, m) of the gradient. For pads without opposite normals that differ,
-        compute the forces (k, 1) instead."""
+        """Compute the inputs (k, m) with respect to which `_gradient` holds derivatives, in another
+        cell.
+
+        If `pads` is True and the pads' normals are not opposite, return the normal forces (k, 1) of
+        the force-controlled arm in the k governing cases [N] instead.
+        """
         cases = worst_cases(command_model(cell), cell.uncertainty, self._leader)
         assert len(cases) == self._count, "no range of the uncertainty begins or ends"
         cases = cases[self._governing]
@@ -282,9 +312,12 @@ class GoverningForce:
 
     @cached_property
     def _gradient(self) -> Array:
-        """Gradient (k, 2, m) of each governing case's force by `_inputs`, once for either
-        friction coefficient slightly lowered: the lower coefficient decides how the opposed
-        force is shared."""
+        """Gradient (k, 2, m) of the force in each of k governing cases with respect to the m inputs
+        of `_inputs`.
+
+        The second axis has the gradients with the friction coefficient of robot 0, and of robot 1,
+        slightly lowered: the lower coefficient decides how the force between the arms is shared.
+        """
         if self._squeezed:
             numbers = WorkcellParameters(self._workcell)
             made = case_gradient_function(numbers.symbols(), numbers=True)

@@ -44,13 +44,13 @@ STEP = 1e-3
 
 @dataclass(frozen=True)
 class SqueezeSettings:
-    """Settings of the commanded forces.
+    """Settings of the commanded normal forces.
 
     Attributes:
-        factor: commanded squeeze over the least squeeze that holds the box; None for the force that
-            holds it in every case of the workcell's uncertainty.
-        leader: index of the arm that keeps its place.
-        smoothing: half the width of the time window of the smoothing [s].
+        factor: ratio of the commanded squeeze to the least squeeze that holds the box; None to
+            command the force that holds the box in every case of the workcell's uncertainty.
+        leader: index of the position-controlled arm; the other arm is force controlled.
+        smoothing: half the width of the time window over which the forces are smoothed [s].
     """
 
     factor: float | None = None
@@ -73,7 +73,13 @@ class SqueezeSettings:
 
 @dataclass(frozen=True)
 class Contribution:
-    """Rise of the largest commanded force by one source of uncertainty [N]."""
+    """Share of the largest commanded force that is due to one source of uncertainty.
+
+    Attributes:
+        name: name of the source, such as 'friction', or 'least force' for the force without
+            uncertainty.
+        force: rise of the largest commanded force by this source [N].
+    """
 
     name: str
     force: float
@@ -102,18 +108,18 @@ UNCERTAINTY_SOURCES = {
 
 @dataclass(frozen=True)
 class Squeeze:
-    """How the commanded forces came about.
+    """Record of how the commanded normal forces were computed.
 
     Attributes:
-        leader: index of the arm that keeps its place; the other is force-controlled.
-        factor: commanded squeeze over the least squeeze that holds the box; None if the forces are
-            robust forces.
-        uncertainty: the uncertainty in every case of which the forces hold the box; None if a
-            factor was used.
-        smoothing: half the width of the time window of the smoothing [s].
-        parts: contributions to the largest commanded force, the least force first. They add up to
-            the largest commanded force.
-        holders: word for the pads or hands that hold the payload.
+        leader: index of the position-controlled arm; the other arm is force controlled.
+        factor: ratio of the commanded squeeze to the least squeeze that holds the box; None if the
+            commanded forces are robust forces.
+        uncertainty: ranges within which the forces hold the box in every case; None if `factor` was
+            used.
+        smoothing: half the width of the time window over which the forces were smoothed [s].
+        parts: contributions to the largest commanded force, the least force first. Their sum is the
+            largest commanded force.
+        holders: word for what holds the payload, such as pads or hands.
         order: verb of the command, as in 'press with 80 N'.
     """
 
@@ -152,26 +158,28 @@ def extra_normal_force(
     least: Array,
     itemised: bool = True,
 ) -> tuple[Array, Squeeze]:
-    """Compute the force (n,) [N] that the force-controlled arm presses beyond its planned force.
+    """Compute the force (n,) [N] that the force-controlled arm is to press in addition to its
+    planned force.
 
-    The commanded force is smooth where the planned forces are. Neither robot presses less than
-    planned, nor less than evenly pressing pads need in any case of the uncertainty, in motion or at
-    rest. The force of the other arm rises by `ContactModel.internal_force_ratio` times as much.
+    The commanded force is smooth where the planned forces are smooth. Neither robot presses less
+    than planned, nor less than evenly pressing pads need in any case of the uncertainty, in motion
+    or at rest. The force of the position-controlled arm rises by
+    `ContactModel.internal_force_ratio` times the result.
 
     Args:
         workcell: the workcell.
         settings: settings of the commanded forces.
         time: (n,) times of the samples, not decreasing [s].
         motion: motion of the box at the samples.
-        least: (n, 2) planned normal forces [N].
-        itemised: True for one contribution per source of uncertainty; False for one contribution in
-            total.
+        least: (n, 2) planned normal force of each robot [N].
+        itemised: True for one contribution per source of uncertainty; False for a single
+            contribution.
 
     Returns:
-        The extra force, and how it came about.
+        The additional force, and a record of how it was computed.
 
     Raises:
-        SettingsError: the uncertainty leaves no friction or patch.
+        SettingsError: the uncertainty leaves no friction or contact patch.
     """
     leader, contact, model = settings.leader, command_model(workcell), robust_model(workcell)
     planned, uncertainty = least[:, 1 - leader], workcell.uncertainty
@@ -205,8 +213,15 @@ def extra_normal_force(
 def _contributions(
     model: RobustModel, leader: int, motion: HeldMotion, planned: Array
 ) -> list[Contribution]:
-    """Compute by how much each source of uncertainty, added in order, raises the largest robust
-    force."""
+    """Compute by how much each source of uncertainty raises the largest robust force of the
+    force-controlled arm, when the sources are added one after the other.
+
+    Args:
+        model: computes robust forces of the workcell.
+        leader: index of the position-controlled arm.
+        motion: motion of the box at n samples.
+        planned: (n,) planned normal force of the force-controlled arm [N].
+    """
     uncertainty, names = model.workcell.uncertainty, tuple[str, ...]()
     before = float(
         _in_every_case(model, uncertainty.restrict_to(names), leader, motion, planned).max()
@@ -230,8 +245,16 @@ def _in_every_case(
     motion: HeldMotion,
     planned: Array | float,
 ) -> Array:
-    """Compute the force (n,) [N] that holds every case of an uncertainty in motion and at rest, at
-    least the planned force."""
+    """Compute the force (n,) [N] of the force-controlled arm that holds the box in every case of an
+    uncertainty, both moving and at rest at the same poses.
+
+    Args:
+        model: computes robust forces of the workcell.
+        uncertainty: ranges of the uncertain quantities.
+        leader: index of the position-controlled arm.
+        motion: motion of the box at n samples.
+        planned: lower bound of the result, (n,) or one for all samples [N].
+    """
     held = model.commanded(motion, uncertainty, leader, planned)
     return model.commanded(at_standstill(motion), uncertainty, leader, held)
 
@@ -239,16 +262,20 @@ def _in_every_case(
 def largest_commanded(
     workcell: Workcell, motion: HeldMotion, planned: Array, uncertainty: Uncertainty, leader: int
 ) -> Array:
-    """Compute the largest commanded force of each robot (2,) [N] that holds a motion in every case
-    of an uncertainty.
+    """Compute the largest normal force (2,) [N] of each robot along a motion, if the
+    force-controlled robot presses hard enough for every case of an uncertainty.
 
-    Only the few samples that can attain the largest forces are computed.
+    Only the few samples where the largest forces can lie are computed.
 
     Args:
-        planned: (n, 2) planned normal forces [N].
+        workcell: the workcell.
+        motion: motion of the box at n samples.
+        planned: (n, 2) planned normal force of each robot [N].
+        uncertainty: ranges of the uncertain quantities.
+        leader: index of the position-controlled arm.
 
     Raises:
-        SettingsError: the uncertainty leaves no friction or patch.
+        SettingsError: the uncertainty leaves no friction or contact patch.
     """
     follower, box = 1 - leader, box_motion(motion)
     most = np.argsort(-planned[:, follower])[:MOST]
@@ -263,20 +290,21 @@ def largest_commanded(
 def commanded_forces(
     workcell: Workcell, carry: Carry, settings: SqueezeSettings, itemised: bool = True
 ) -> tuple[Array, Squeeze]:
-    """Compute the normal forces (n, 2) [N] to command along a carry.
+    """Compute the normal forces (n, 2) [N] that both robots exert along a carry under a commanded
+    squeeze.
 
-    The planned force of the force-controlled arm rises by `extra_normal_force`; that of the leader
-    follows by `ContactModel.raised`.
+    The force of the force-controlled arm is the planned force plus `extra_normal_force`. The force
+    of the position-controlled arm follows by `ContactModel.raised`.
 
     Args:
         workcell: the workcell.
         carry: the carry at n samples.
         settings: settings of the commanded forces.
-        itemised: True for one contribution per source of uncertainty; False for one contribution in
-            total.
+        itemised: True for one contribution per source of uncertainty; False for a single
+            contribution.
 
     Returns:
-        The forces, and how they came about.
+        The forces, and a record of how they were computed.
     """
     held = carry.normal_force
     extra, squeeze = extra_normal_force(workcell, settings, carry.time, carry, held, itemised)
@@ -284,16 +312,19 @@ def commanded_forces(
 
 
 def smooth_above(time: Array, values: Array, width: float) -> Array:
-    """Compute a smooth upper bound of a curve, level at both ends.
+    """Compute a smooth curve that is nowhere below a given curve, and level at both ends.
 
-    The bound is the maximum of the curve within a window, averaged over the same window by a smooth
-    kernel. Each of these maxima is at least the value in the middle of the kernel, so their average
-    is too.
+    At each time the maximum of the curve within a window is taken, and these maxima are averaged
+    over the same window with a smooth kernel. Each maximum that enters the average at a time is at
+    least the value of the curve at that time, so the average is as well.
 
     Args:
-        time: (n,) not decreasing [s].
-        values: (n,) values of the curve, linear between the times.
+        time: (n,) times, not decreasing [s].
+        values: (n,) values of the curve, which is linear between the times.
         width: half the width of the window [s].
+
+    Returns:
+        Values (n,) of the smooth curve.
     """
     count = max(2, int(np.ceil((time[-1] - time[0]) / STEP)) + 1)
     grid = np.linspace(time[0], time[-1], count)
