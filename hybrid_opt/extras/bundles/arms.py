@@ -61,13 +61,14 @@ def require_arms(
     has_address: bool = False,
     any_arm: bool = False,
 ) -> None:
-    """Check that arms are of the maker of a target and have everything that it needs.
+    """Check that both arms are of the maker of a target and have the joints and addresses that the
+    target needs.
 
     Args:
         workcell: the cell with the arms.
         target: name of the target, for the message.
         maker: `ABB`, `FRANKA` or `UR`.
-        axes: supported numbers of turning joints.
+        axes: numbers of joints per arm that the target supports; all joints have to turn.
         has_address: True if the target needs the addresses of both controllers.
         any_arm: True to accept arms that do not look like the maker's.
 
@@ -109,10 +110,11 @@ found."""
 
 @dataclass(frozen=True)
 class Lines:
-    """Names of the outputs and inputs by which a target switches hands and reads their state.
+    """Names that a target allows for the outputs that switch hands, and for the inputs that report
+    their state.
 
     Attributes:
-        output, input: regular expressions of the names.
+        output, input: regular expression of an output's and of an input's name.
         meaning: description of both names, for messages.
     """
 
@@ -121,7 +123,11 @@ class Lines:
     meaning: str
 
     def require(self, workcell: Workcell, target: str) -> None:
-        """Check that the names of a cell's drivers are valid for a target. Inputs may be left out.
+        """Check that the names of outputs and inputs in the drivers of a cell are valid for a
+        target. A driver need not name an input.
+
+        Args:
+            target: name of the target, for the message.
 
         Raises:
             SettingsError: a name is not valid; the message states the key and the allowed names.
@@ -147,16 +153,17 @@ def plan_of(
     stiffness: float | None,
     presses: bool,
 ) -> dict[str, Any]:
-    """Return the values of the drivers that a bundle was planned for. The bundle's bring-up program
-    compares them with the values that it measures.
+    """Return the driver settings for which a bundle was planned, as JSON values. The bundle's
+    bring-up program compares them with measured values.
 
     Args:
         workcell: the cell.
         target: name of the target.
         program: name of the program that runs the job.
-        leads: compensated part of each arm's lag [s].
-        stiffness: of each arm at its pad [N/m]; None if the job does not depend on it.
-        presses: whether a sensor measures how strongly a block is pressed.
+        leads: for each arm, the part of its delay that the program compensates by sending commands
+            ahead [s].
+        stiffness: stiffness of each arm at its pad [N/m]; None if the job does not depend on it.
+        presses: True if the program can measure by a sensor how strongly a block is pressed.
     """
     drivers = [vars(robot.driver).items() for robot in workcell.robots]
     return {
@@ -178,7 +185,7 @@ SERVICES = Lines(
 
 
 def addressed(workcell: Workcell, addresses: tuple[str, str]) -> Workcell:
-    """Return the cell with these host names or IP addresses of the controllers.
+    """Return the cell with other host names or IP addresses of its two controllers.
 
     Raises:
         SettingsError: an address is neither a host name nor an IP address.
@@ -192,7 +199,8 @@ def addressed(workcell: Workcell, addresses: tuple[str, str]) -> Workcell:
 
 
 def described(robot: Robot) -> str:
-    """Return the words of a robot's description that may name its maker, in lower case."""
+    """Return the words that may name the maker of a robot: file, name, links and xacro arguments,
+    in lower case."""
     urdf = robot_urdf(robot)
     words = [robot.urdf.name, urdf.name, *urdf.links]
     words += [value for _, value in robot.xacro_arguments]
@@ -200,19 +208,21 @@ def described(robot: Robot) -> str:
 
 
 def robot_prefix(name: str) -> str:
-    """Return a robot's name in a form that is valid as a prefix in ROS and RAPID: letters, digits,
-    underscores."""
+    """Convert a robot's name to a prefix that ROS and RAPID accept: lower-case letters, digits and
+    underscores, with '_' at the end."""
     plain = "".join(c if c.isascii() and c.isalnum() else "_" for c in name.lower())
     return f"{'r' if not plain[:1].isalpha() else ''}{plain}_"
 
 
 def comment(text: str) -> str:
-    """Return a text without characters that could end a comment line in a robot's language."""
+    """Return a text with a '?' for each character that could end a comment line in a robot's
+    language, cut to the longest allowed length."""
     return "".join(c if " " <= c <= "~" else "?" for c in text)[:_LONGEST_COMMENT]
 
 
 def prefixes(workcell: Workcell) -> tuple[str, str]:
-    """Return the prefix of the names of each robot's links and joints.
+    """Return for each robot the prefix of its links' and joints' names in ROS; '' for both arms of
+    one machine.
 
     Raises:
         SettingsError: the prefixes that the drivers state would give joints of both arms the same
@@ -236,8 +246,8 @@ def prefixes(workcell: Workcell) -> tuple[str, str]:
 
 
 def ros_joints(workcell: Workcell) -> dict[str, int]:
-    """Return the index of each joint among both arms' stacked joints, by its name in ROS. A joint
-    that moves both arms of a machine counts to the first arm.
+    """Return each joint's column in arrays (n, joints) of both arms side by side, by the joint's
+    name in ROS. A joint that moves both arms of a machine has its column in the first arm.
 
     Raises:
         SettingsError: joints of both arms would have the same names.
@@ -248,15 +258,21 @@ def ros_joints(workcell: Workcell) -> dict[str, int]:
 
 
 def pad_frame(prefix: str, arm: int) -> str:
-    """Return the name of the frame of an arm's pad."""
+    """Return the name of the frame of an arm's pad.
+
+    Args:
+        prefix: prefix of the arm's names in ROS, or ''.
+        arm: index of the arm, used if there is no prefix.
+    """
     return f"{prefix or f'arm_{arm + 1}_'}{PAD}"
 
 
 def description(workcell: Workcell, q: Array) -> str:
-    """Return the URDF of the cell with both arms.
+    """Return the URDF of the cell with both arms, as text.
 
     Args:
-        q: (joints,) initial joint positions in a simulator, both arms side by side [rad].
+        q: (joints,) initial joint positions in a simulator, both arms side by side [rad, or m for
+            sliding joints].
     """
     root = ElementTree.Element("robot", {"name": "cell"})
     ElementTree.SubElement(root, "link", {"name": WORLD})
@@ -309,7 +325,8 @@ def _add_robot(root: ElementTree.Element, robot: Robot, prefix: str, moving: set
 
 
 def _hold(joint: ElementTree.Element, position: float) -> None:
-    """Change a joint to a fixed joint at a position [rad or m]."""
+    """Change a URDF joint, in place, to a fixed joint at a position [rad, or m for a sliding
+    joint]."""
     origin, axis = joint.find("origin"), joint.find("axis")
     xyz, rpy = (
         _numbers("0 0 0" if origin is None else origin.get(key, "0 0 0")) for key in ("xyz", "rpy")
@@ -329,7 +346,14 @@ def _hold(joint: ElementTree.Element, position: float) -> None:
 
 
 def _add_fixed(root: ElementTree.Element, parent: str, name: str, bodies: Sequence[Body]) -> None:
-    """Add bodies, at their poses on a link, as a separate link that is fixed to it."""
+    """Add a link with bodies to a URDF, fixed to another link.
+
+    Args:
+        root: the URDF.
+        parent: name of the link to which the new one is fixed, in the same place.
+        name: name of the new link.
+        bodies: the bodies, at their poses on the link.
+    """
     _joint(root, f"{name}_fixed", parent, name, np.eye(4))
     link = ElementTree.SubElement(root, "link", {"name": name})
     for body in bodies:
@@ -337,8 +361,12 @@ def _add_fixed(root: ElementTree.Element, parent: str, name: str, bodies: Sequen
 
 
 def _shapes(link: ElementTree.Element, shape: Shape | Capsule | UrdfMesh, pose: Array) -> None:
-    """Add a shape as visual and as collision geometry. Capsules, which URDF lacks, become a
-    cylinder and two spheres."""
+    """Add a shape to a URDF link, as visual and as collision geometry. Capsules, which URDF lacks,
+    become a cylinder and two spheres.
+
+    Args:
+        pose: (4, 4) pose of the shape on the link.
+    """
     if isinstance(shape, Capsule):
         _shapes(link, Cylinder(shape.radius, shape.length), pose)
         for side in (-0.5, 0.5):

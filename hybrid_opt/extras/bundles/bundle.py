@@ -57,13 +57,14 @@ DIGEST_LENGTH = 8
 
 @dataclass(frozen=True)
 class Origin:
-    """Origin of a carry: the study and the point of its front.
+    """Source of a carry: a study and one point of its front.
 
     Attributes:
         study: name of the study or, without one, of the workcell.
         algorithm: name of the search, with '-polished' if the front was polished.
-        replica: number of the replica; None if there is none.
-        point: index of the candidate among the evaluations, or another number of the point.
+        replica: number of the replica of the search; None if there is none.
+        point: index of the candidate in the order of evaluation, or the number of the point on its
+            front; None if there is none.
         file: path of the trajectory file, '' if there is none.
         sha256: SHA-256 of the trajectory file.
         provenance: provenance stored in the trajectory file.
@@ -79,8 +80,7 @@ class Origin:
 
     @classmethod
     def of_file(cls, path: Path, content: bytes, provenance: Mapping[str, Any]) -> Origin:
-        """Derive the origin of a trajectory file from its place in a results folder and its
-        content.
+        """Derive the origin of a trajectory file from its place in a results folder.
 
         Args:
             path: path of the file, such as RESULTS/selected/ALGORITHM/REPLICA.json.
@@ -101,7 +101,7 @@ class Origin:
         )
 
     def name(self, job: Job) -> str:
-        """Return a folder name that is unique to this carry."""
+        """Return a folder name that is unique to the carry of a job."""
         words = [_word(self.study or job.workcell.name), _word(self.algorithm)]
         words += [] if self.replica is None else [f"r{self.replica:02d}"]
         words += [] if self.point is None else [f"p{self.point:04d}"]
@@ -311,7 +311,7 @@ def _skew(found: Skew) -> dict[str, Any]:
 
 
 def job_digest(job: Job) -> str:
-    """Compute the SHA-256 of everything that determines a job: cell, path, timing, forces."""
+    """Compute a SHA-256 over everything that determines a job: cell, path, timing and forces."""
     digest = hashlib.sha256(job.workcell.digest.encode())
     carry = job.timing.driven
     for values in (carry.x, carry.time, *(phase.force.normal for phase in job.phases)):
@@ -325,7 +325,7 @@ def _number(value: Any) -> int | None:
 
 
 def _word(text: str) -> str:
-    """Return a text in a form that is valid in a file's name on every system."""
+    """Convert a text to a form that is valid in the name of a file on every system."""
     kept = "".join(c if c.isascii() and c.isalnum() else "-" for c in text.lower())
     return "-".join(part for part in kept.split("-") if part)[:LONGEST_WORD].strip("-")
 
@@ -383,12 +383,12 @@ def export(
 
 
 def prepared(job: Job, name: str, options: BundleOptions) -> Export:
-    """Return a job sampled at the requested step, or at the longest step for which the force error
-    stays within the tracking share.
+    """Sample a job at the requested time step, or else at the longest one for which the error of
+    the pads' forces between samples stays within the share `TRACKED`.
 
     Args:
         job: the job.
-        name: name of the target, which states the possible steps.
+        name: name of the target, which states the possible time steps.
         options: options of the bundle.
 
     Raises:

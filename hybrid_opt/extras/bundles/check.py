@@ -78,13 +78,13 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class JointTrajectory:
-    """Joints of both arms over time.
+    """Joint positions of both arms over time, as read from a file.
 
     Attributes:
-        time: (n,) ascending [s].
-        known: (n, joints) each, both arms side by side: positions, then velocities and
-            accelerations if the file has them [rad, m, s].
-        carry: beginning and end of the carry [s]; None if the file does not state them.
+        time: (n,) ascending times from 0 [s].
+        known: arrays (n, joints), both arms side by side: positions, then velocities and
+            accelerations if the file has them [rad or m, and s].
+        carry: first and last time of the carry [s]; None if the file does not state them.
     """
 
     time: Array
@@ -93,26 +93,26 @@ class JointTrajectory:
 
     @property
     def q(self) -> Array:
-        """(n, joints) joint positions [rad, m]."""
+        """(n, joints) joint positions of both arms side by side [rad, or m for sliding joints]."""
         return self.known[0]
 
 
 @dataclass(frozen=True, eq=False)
 class Finding:
-    """Result of the check of a trajectory.
+    """Result of the check of a joint trajectory.
 
     Attributes:
-        held: (n,) True for samples at which the pads hold the box.
-        along, across: largest change of the pads' relative position while they hold the box, along
-            the normal and across it [m].
-        use: largest value over its limit, by name of the limit.
+        held: (n,) True for samples at which both pads hold the box.
+        along, across: largest deviation of the second pad from its planned place relative to the
+            first pad while they hold the box, along the first pad's normal and across it [m].
+        use: largest value over its limit, by name of the limit; above 1 the limit is exceeded.
         collides: first pair that collides or cannot be proven free while the box is held; '' for
             none.
-        normal_force: (2,) largest normal force that each arm needs [N].
+        normal_force: (2,) largest normal force that each arm needs to hold the box [N].
         rated: (2,) reference force of each arm [N].
-        balanced: whether friction and patches can hold the box at every sample.
+        balanced: True if forces of the pads can hold the box at every sample.
         duration: duration of the trajectory [s].
-        interpolation: interpolation between samples.
+        interpolation: assumed interpolation between samples.
     """
 
     held: Mask
@@ -128,7 +128,7 @@ class Finding:
 
     @property
     def problems(self) -> list[str]:
-        """Reasons against running the trajectory."""
+        """Sentences with reasons why the trajectory should not be run; empty if there are none."""
         if not self.held.any():
             return ["the pads hold the box nowhere: another cell, or another order of the joints?"]
         found = []
@@ -167,8 +167,8 @@ class Finding:
 
 
 def read_trajectory(path: Path, workcell: Workcell) -> JointTrajectory:
-    """Read a trajectory of a cell's joints from a file: CSV, JSON (job.json, or a message of ROS
-    2), or YAML of ROS 2.
+    """Read the joint positions of a cell's arms from a file: CSV, JSON (job.json, or a message of
+    ROS 2), or YAML of ROS 2.
 
     Raises:
         ResultsError: the file cannot be read, or lacks joints of the cell.
@@ -201,8 +201,12 @@ of the joint."""
 
 
 def _csv_columns(text: str) -> tuple[Columns, tuple[float, float] | None]:
-    """Read the columns of a CSV file, and the time span [s] in which the column `phase` is
-    'carry'."""
+    """Read the columns of a CSV file with joint positions.
+
+    Returns:
+        The columns; and the first and last time at which the column `phase` is 'carry' [s], None
+        without any.
+    """
     rows = list(csv.reader(io.StringIO(text)))
     header, body = rows[0], [row for row in rows[1:] if row]
     words = [re.sub(r"\s*\[.*\]$", "", name).strip() for name in header]
@@ -250,7 +254,12 @@ def _document_columns(document: Any) -> Columns:
 
 
 def _chosen(columns: Columns, workcell: Workcell) -> JointTrajectory:
-    """Select the cell's joints from the columns, under any of their usual names."""
+    """Select the joints of a cell from the columns of a file. A joint may be named ROBOT/JOINT, by
+    its name in ROS, or plainly if the plain name is unique.
+
+    Raises:
+        ValueError: a joint is missing, or times or values are not valid.
+    """
     time, values = columns
     names = [
         (f"{robot.name}/{joint}", f"{prefix}{joint}", joint)
@@ -290,20 +299,21 @@ def check(
     held: tuple[float, float] | None = None,
     interpolation: Interpolation | None = None,
 ) -> Finding:
-    """Check a trajectory in a cell.
+    """Check whether two arms can carry the box along a joint trajectory: pads, limits, collisions
+    and normal forces.
 
     Args:
         cell: the cell.
         trajectory: the trajectory.
-        held: beginning and end of the time in which the pads hold the box [s]; None for the carry
-            that the file states, or else the longest time in which the pads' relative pose can hold
-            the box.
+        held: first and last time at which the pads hold the box [s]; None for the carry that the
+            file states, or else the longest time in which the pads are at their planned places
+            relative to each other.
         interpolation: the controller's interpolation between samples; None for one that uses all
             known derivatives, as ROS 2's joint trajectory controller does.
 
     Raises:
-        SettingsError: the trajectory has no samples in this time, or the file lacks columns that
-            the interpolation needs.
+        SettingsError: too few samples lie between the times of `held`, or the file lacks columns
+            that the interpolation needs.
     """
     workcell, time = cell.workcell, trajectory.time
     held = held or trajectory.carry
@@ -353,15 +363,16 @@ def check(
 
 
 def _places(time: Array) -> Array:
-    """Return the times (n,) of the samples, and the times at the shares `BETWEEN` of each step."""
+    """Return ascending times (k,) [s]: those of n samples (n,), and some between two neighbours, at
+    the shares `BETWEEN` of the step."""
     steps = np.diff(time)
     inside = [time[:-1] + share * steps for share in (0.0, *BETWEEN)]
     return np.append(np.column_stack(inside).ravel(), time[-1])
 
 
 def _load(cell: Cell) -> NumericFunction:
-    """Return the compiled `load_function` alone. A timing model would also load the compiled
-    passes."""
+    """Return the compiled function of the contact forces. It is loaded alone, because a timing
+    model would also load its compiled passes."""
 
     def make(model: CellModel) -> Mapping[str, ca.Function]:
         from symbolic.contact.load import load_function
@@ -372,8 +383,15 @@ def _load(cell: Cell) -> NumericFunction:
 
 
 def _certificate(cell: Cell, joints: BPoly, time: Array) -> str:
-    """Certify the motion of joints from the first to the last of times (n,). Return the first
-    colliding pair as a text; '' if the motion is proven free."""
+    """Prove that the motion of both arms and box is free of collisions.
+
+    Args:
+        joints: joint positions of both arms over time.
+        time: (n,) times of the samples, first to last of the proof [s].
+
+    Returns:
+        The first colliding pair and its time as text; '' if the motion is proven free.
+    """
     workcell = cell.workcell
 
     def at(places: Array) -> tuple[Array, Array, Array]:
@@ -390,8 +408,16 @@ def _certificate(cell: Cell, joints: BPoly, time: Array) -> str:
 
 
 def _held(along: Array, across: Array) -> Mask:
-    """Return (n,) True for the longest run of samples at which the pads' relative pose can hold the
-    box."""
+    """Find the longest run of samples at which both pads are near their planned places relative to
+    each other.
+
+    Args:
+        along: (n,) error of the distance between the pads along the normal [m].
+        across: (n,) displacement of one pad against the other across the normal [m].
+
+    Returns:
+        (n,) True for samples of this run.
+    """
     near = (np.abs(along) < TOUCHING) & (across < TOUCHING)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], near.astype(int), [0]])))
     runs = list(zip(edges[::2], edges[1::2], strict=True))
@@ -404,8 +430,12 @@ def _held(along: Array, across: Array) -> Mask:
 
 
 def _poses(workcell: Workcell, q: Array) -> Array:
-    """Compute the box poses (n, 6) that follow from the first arm's pad, in the task's
-    convention."""
+    """Compute the box poses (n, 6) [m, rad] that follow from the first arm's pad, in the convention
+    of the cell's task.
+
+    Args:
+        q: (n, joints) joint positions of both arms side by side [rad or m].
+    """
     T_pad_box = inverse(workcell.contacts[0].T_box_pad)
     T = pad_places(workcell, 0, joints_of(workcell, q)[0]) @ T_pad_box
     orientation = workcell.task.orientation
@@ -422,7 +452,7 @@ def _most(values: Array, limit: float) -> float:
 
 
 def as_document(finding: Finding) -> Mapping[str, Any]:
-    """Convert the result to JSON values."""
+    """Convert the result of a check to JSON values."""
     return {
         "duration": finding.duration,
         "interpolation": finding.interpolation,

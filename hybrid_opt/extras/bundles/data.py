@@ -27,10 +27,8 @@ SCHEMA = "job.schema.json"
 
 
 def data_files(export: Export) -> dict[str, str | bytes]:
-    """Return the table, the JSON file with its schema, and the recording.
-
-    The recording needs the extra `ros`. Without it a text file states what to install.
-    """
+    """Return the contents of a job's data files by path: a table, a JSON file with its schema, and
+    a recording for ROS 2."""
     schema = (files("hybrid_opt.extras.bundles") / SCHEMA).read_text("utf-8")
     tables = {"job.csv": job_table(export), "job.json": job_text(export), SCHEMA: schema}
     return tables | recording(export)
@@ -82,8 +80,8 @@ RECORDED = (
 
 
 def recording(export: Export) -> dict[str, str | bytes]:
-    """Return the recording, in which times count from zero. Without the extra `ros` return a note
-    instead."""
+    """Return the files of a ROS 2 recording of a job by path; its times count from zero. Without
+    the extra `ros` return a note instead."""
     try:
         from mcap.writer import Writer
         from rosbags.typesys import Stores, get_typestore
@@ -110,7 +108,11 @@ def recording(export: Export) -> dict[str, str | bytes]:
 
 
 def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, str, Any]]:
-    """Yield the messages of every sample, each with its time [ns] and topic."""
+    """Yield the messages of every sample, each with its time [ns] and topic.
+
+    Args:
+        types: ROS message classes by name.
+    """
     sampled, cell, joined = export.sampled, export.workcell, prefixes(export.workcell)
     joints = ros_joints(cell)
     places = list(joints.values())
@@ -121,7 +123,7 @@ def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, s
     boxes = box_placement(cell.task.orientation, sampled.pose)
 
     def of(kind: str, *values: Any) -> Any:
-        """Build a message from its fields, in order."""
+        """Build a ROS message of the type `kind` from its fields, in order."""
         package, name = kind.split("/")
         return types[f"{package}/msg/{name}"](*values)
 
@@ -180,7 +182,13 @@ def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, s
 
 
 def pad_wrench(sampled: SampledJob, arm: int) -> Array:
-    """Compute the force and moment (n, 6) [N, N m] of a pad on the box, along the pad's axes."""
+    """Compute the force and moment (n, 6) [N, N m] that a robot's pad exerts on the box, about the
+    pad's centre along the pad's axes.
+
+    Args:
+        sampled: the job at n samples.
+        arm: index of the robot.
+    """
     T_box_pad = sampled.job.workcell.contacts[arm].T_box_pad
     turned = box_rotation(sampled.job.workcell.task.orientation, sampled.pose)
     R_world_pad = turned @ T_box_pad[:3, :3]

@@ -42,15 +42,15 @@ UNKNOWN_TOOL_MASS = 0.1
 
 
 def require_egm(workcell: Workcell, leader: int) -> None:
-    """Check that the pressing arm of a cell has force control, and that the lag of both arms is
-    known.
+    """Check that a cell's force-controlled arm has force control on its controller, and that the
+    delays of both arms are known.
 
     Args:
         workcell: the cell.
-        leader: index of the arm that keeps its position; the other arm presses.
+        leader: index of the arm that keeps its position; the other one is force-controlled.
 
     Raises:
-        SettingsError: force control is missing or a lag is unknown.
+        SettingsError: force control is missing or the delay of an arm is unknown.
     """
     robots = workcell.robots
     robot, other = robots[1 - leader], robots[leader]
@@ -74,15 +74,19 @@ def require_egm(workcell: Workcell, leader: int) -> None:
 
 
 def tasks_of(export: Export) -> tuple[str, str]:
-    """Return the names of both arms' tasks on the controller."""
+    """Return the name of each arm's RAPID task on the controller."""
     two_armed = all(len(joints) == SEVEN for joints in export.job.joint_names)
     return TWO_ARMED_TASKS if two_armed else TASKS
 
 
 def _checked_start(joints: int) -> Iterator[str]:
-    """Yield the lines of the RAPID procedure that ends the program if the arm is not at the first
-    position. It makes no move to that position, because such a move would not be checked for
-    collisions."""
+    """Yield the lines of a RAPID procedure that ends the program if the arm is not at the first
+    position of the job. The procedure does not move there, because such a move would not be checked
+    for collisions.
+
+    Args:
+        joints: number of joints of the arm.
+    """
     axes = [f"robax.rax_{axis}" for axis in range(1, SIX + 1)]
     axes += ["extax.eax_a"] if joints == SEVEN else []
     yield "  PROC CarryCheckStart()"
@@ -124,8 +128,8 @@ def _frame(pose: Array) -> str:
 
 
 def _target(degrees: Array) -> str:
-    """Return RAPID's jointtarget for joint positions (joints,) [degrees]. The seventh joint counts
-    as an external axis; the other external axes are unused."""
+    """Return RAPID's jointtarget for joint positions (joints,) [degrees]. Of seven joints, the
+    third counts as an external axis; other external axes are unused."""
     if len(degrees) == SIX:
         return f"[{_numbers(degrees)},[9E9,9E9,9E9,9E9,9E9,9E9]]"
     robot = np.delete(degrees, EXTRA)

@@ -61,15 +61,15 @@ MOST_INTERVALS = 1500
 
 @dataclass(frozen=True)
 class Gap:
-    """Error of the pads between two samples of a job while they hold the box.
+    """Error of the pads between two samples of a job while both pads hold the box.
 
     Attributes:
         step: longest time between two samples [s].
         interpolation: kind of interpolation between two samples.
-        along: largest change of the distance between the pads along the normal [m].
-        across: largest displacement of one pad against the other across the normal [m].
-        force: error of the normal forces from the change along the normal [N].
-        share: this error over the least commanded normal force.
+        along: largest change of the distance between the pads along the first pad's normal [m].
+        across: largest displacement of one pad against the other across this normal [m].
+        force: change of the normal forces that follows from `along` [N].
+        share: `force` over the least commanded normal force.
     """
 
     step: float
@@ -83,9 +83,10 @@ class Gap:
 def chosen_step(
     job: Job, steps: Sequence[float], interpolation: Interpolation, stiffness: float
 ) -> float:
-    """Return the longest time step [s] with which the pads' forces stay near the commanded ones.
+    """Return the longest time step for which the normal forces stay near the commanded ones between
+    samples [s].
 
-    Between two samples the pads miss their distance, which changes the normal forces. A step is
+    Between two samples the distance of the pads changes, and with it the normal forces. A step is
     accepted if this error is at most the share `TRACKED` of the least commanded force.
 
     Args:
@@ -111,7 +112,7 @@ def chosen_step(
 
 
 def gap_of(sampled: SampledJob, interpolation: Interpolation, stiffness: float) -> Gap:
-    """Compute the error of the pads between the samples of a job.
+    """Compute how far the pads deviate from their planned places between the samples of a job.
 
     Args:
         sampled: the job at given time steps.
@@ -140,13 +141,13 @@ def gap_of(sampled: SampledJob, interpolation: Interpolation, stiffness: float) 
 
 
 def between(time: Array, known: Sequence[Array], interpolation: Interpolation) -> BPoly:
-    """Interpolate joint positions between samples as a controller does, by the polynomial of least
-    degree through the known values at both ends of a step.
+    """Interpolate joint positions between samples as a controller does: in each step by the
+    polynomial of least degree that has the given positions and derivatives at both ends.
 
     Args:
         time: (n,) ascending times [s].
-        known: arrays (n, joints) of positions, then of velocities and accelerations as far as the
-            interpolation uses them [rad or m, and s].
+        known: arrays (n, joints) of positions, then velocities, then accelerations; those that the
+            interpolation does not use are ignored [rad or m, and s].
         interpolation: kind of interpolation.
     """
     taken = np.stack(known[: DERIVATIVES[interpolation]], axis=1)
@@ -154,11 +155,11 @@ def between(time: Array, known: Sequence[Array], interpolation: Interpolation) -
 
 
 def pad_errors(workcell: Workcell, q: Array) -> tuple[Array, Array]:
-    """Compute the error of the relative pose of both pads.
+    """Compute the deviation of the second pad from its planned place relative to the first pad.
 
     Args:
         workcell: the cell.
-        q: (n, joints) joint positions of both arms side by side [rad].
+        q: (n, joints) joint positions of both arms side by side [rad or m].
 
     Returns:
         (n,) distance between the pads along the first pad's normal minus the planned distance [m],
@@ -173,8 +174,12 @@ def pad_errors(workcell: Workcell, q: Array) -> tuple[Array, Array]:
 
 
 def pad_places(workcell: Workcell, arm: int, q: Array) -> Array:
-    """Compute the poses (n, 4, 4) of an arm's pad in the world for joint positions (n, joints) of
-    the arm [rad]."""
+    """Compute the poses (n, 4, 4) of an arm's pad in the world.
+
+    Args:
+        arm: index of the arm.
+        q: (n, n_joints) joint positions of this arm [rad or m].
+    """
     robot = workcell.robots[arm]
     model = build_robot_model(robot)
     data, found = model.model.createData(), np.empty((len(q), 4, 4))
@@ -185,8 +190,13 @@ def pad_places(workcell: Workcell, arm: int, q: Array) -> Array:
 
 
 def pad_jacobians(workcell: Workcell, arm: int, q: Array) -> Array:
-    """Compute the Jacobians (n, 6, n_joints) of an arm's pad along the flange's axes for joint
-    positions (n, n_joints) of the arm [m/rad, 1]."""
+    """Compute the Jacobians (n, 6, n_joints) of an arm's pad: linear, then angular velocity along
+    the flange's axes per joint velocity [m/rad, 1].
+
+    Args:
+        arm: index of the arm.
+        q: (n, n_joints) joint positions of this arm [rad or m].
+    """
     robot, found = workcell.robots[arm], np.empty((len(q), 6, q.shape[1]))
     model = build_robot_model(robot)
     data = model.model.createData()
@@ -215,14 +225,15 @@ _model = cache_by_workcell(TimingModel)
 
 @dataclass(frozen=True)
 class Stop:
-    """A stop of both arms along the path of a job.
+    """A stop of both arms together along the path of a job.
 
     Attributes:
-        time: from the planned speed to rest [s].
-        force_use: largest normal force that holds the box in such a stop, over the commanded force.
-        joint_use: largest joint acceleration in such a stop, over its limit.
-        quick: shortest time of a stop that the commanded forces allow if joint limits are ignored
-            [s]. It is used if the arms no longer move together.
+        time: duration from the planned speed to rest [s].
+        force_use: largest normal force that the box needs during the stop, over the commanded
+            force.
+        joint_use: largest joint acceleration during the stop, over its limit.
+        quick: shortest duration of a stop that the commanded forces allow if joint limits are
+            ignored [s]. Programs stop so fast if an arm does not follow its commands.
     """
 
     time: float
@@ -232,10 +243,11 @@ class Stop:
 
 
 def stop_of(job: Job) -> Stop:
-    """Find the shortest stop along the path that the commanded forces allow everywhere in a job.
+    """Find the shortest stop along the path that the commanded forces allow at every place of a
+    job.
 
     Raises:
-        JobError: they allow none.
+        JobError: the commanded forces allow no stop of the tried durations.
     """
     model, motions = _model(job.workcell), [phase.motion for phase in job.phases]
     time = np.concatenate([phase.begin + phase.motion.time for phase in job.phases])
@@ -251,7 +263,8 @@ def stop_of(job: Job) -> Stop:
     places, x = time[::STOP_STRIDE], np.linspace(0.0, 1.0, INSTANTS)
 
     def stop(duration: float) -> Stop:
-        """Compute the stop of this duration [s], tried at all places of the path."""
+        """Compute the largest uses of force and joint limits in stops of this duration [s] that
+        begin at many places of the path."""
         rate = 1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
         slope = -30.0 * x**2 * (1.0 - x) ** 2 / duration
         passed = duration * (x - 2.5 * x**4 + 3.0 * x**5 - x**6)
@@ -309,14 +322,17 @@ SILENCE = 0.1
 
 @dataclass(frozen=True)
 class PartnerStop:
-    """What it costs when one arm stops by itself at the worst moment of a job.
+    """Effect of one arm's unplanned stop at the worst moment of a job, when the other arm has to
+    stop too.
 
     Attributes:
-        time: until the other arm has gone as far as it will, at the planned speed [s].
-        distance: by which the pads are then apart from their relative place [m].
-        survived: distance up to which friction holds the box, at most `distance`; None without a
-            stiffness [m].
-        allowed: the cell's `handling.partner_stop` [m].
+        time: time at the planned speed in which the other arm moves as far as it does until it
+            stands [s].
+        distance: largest displacement of the pads from their relative place that this causes [m].
+        survived: displacement up to which friction holds the box, at most `distance` [m]; None if
+            the stiffness is unknown.
+        allowed: largest displacement that the cell allows, `handling.partner_stop` [m]; None for
+            any.
     """
 
     time: float
@@ -335,7 +351,7 @@ class PartnerStop:
 
     @property
     def warning(self) -> str:
-        """A remedy if friction may lose the box in such a stop; '' if friction holds it."""
+        """Warning and remedy if friction may lose the box in such a stop, else ''."""
         if self.survived is None or self.distance <= self.survived:
             return ""
         return (
@@ -354,14 +370,14 @@ class BundleOptions:
     """Options of a bundle.
 
     Attributes:
-        step: time between samples [s]; None for the longest with which the error of the forces is
-            small enough.
-        any_arm: whether a maker's own language is also written for arms that do not look like this
+        step: time between samples [s]; None for the longest with a small enough error of the
+            forces.
+        any_arm: True to write a maker's own language also for arms that do not look like this
             maker's.
-        stiffness: stiffness of each arm at its pad along the normal [N/m]; None for the drivers'
-            value in the workcell, or the value that follows from the target's gains.
-        skew: time between the starts of both arms that the job has to survive [s]; None for the
-            usual time of the target.
+        stiffness: stiffness of each arm at its pad along the normal [N/m]; None for the value that
+            the workcell states, or that follows from the target's gains.
+        skew: delay between the starts of both arms during which friction has to hold the box [s];
+            None for the usual delay of the target.
         addresses: host names or IP addresses of both controllers; None for those in the workcell.
     """
 
@@ -397,7 +413,7 @@ class Export:
 
     @property
     def job(self) -> Job:
-        """The whole job."""
+        """The job, from approach to retreat."""
         return self.sampled.job
 
     @property
@@ -407,7 +423,7 @@ class Export:
 
     @property
     def follower(self) -> int:
-        """Index of the force-controlled arm, for pads that press."""
+        """Index of the force-controlled arm of pads that press."""
         return 1 - self.job.squeeze.leader
 
     @property
@@ -422,8 +438,8 @@ class Export:
 
     @cached_property
     def gravity(self) -> Array:
-        """(n, joints) torques that balance the weight of the arms and their tools [N m, for sliding
-        joints N]."""
+        """(n, joints) joint torques that balance the weight of arms and tools, both arms side by
+        side [N m, for sliding joints N]."""
         found = []
         for arm, robot in enumerate(self.workcell.robots):
             numeric = build_robot_model(robot).model
@@ -433,8 +449,8 @@ class Export:
 
     @cached_property
     def holding(self) -> Array:
-        """(n, joints) torques at rest with the commanded forces, gravity included [N m, for sliding
-        joints N]."""
+        """(n, joints) joint torques with arms at rest that exert the commanded forces on the box,
+        gravity included, both arms side by side [N m, for sliding joints N]."""
         sampled, model = self.sampled, _model(self.workcell)
         wrench = sampled.wrench.copy()
         for phase in self.job.held:
@@ -451,21 +467,30 @@ class Export:
 
     @cached_property
     def effort(self) -> Array:
-        """(n, joints) torques of the motion with the commanded forces, gravity included [N m, for
-        sliding joints N]. For a joint that moves both arms they balance the contacts of both."""
+        """(n, joints) joint torques of the planned motion with the commanded forces, gravity
+        included, both arms side by side [N m, for sliding joints N]. A joint that moves both arms
+        balances the contact forces of both."""
         return self.sampled.effort + self._of_other(self._contact(self.sampled.wrench))
 
     def _contact(self, wrench: Array) -> Array:
-        """Compute the joint torques (n, joints) with which each arm exerts its wrench, for wrenches
-        (n, 2, 6) [N m, for sliding joints N]."""
+        """Compute the joint torques (n, joints) with which both arms exert their wrenches on the
+        box [N m, for sliding joints N].
+
+        Args:
+            wrench: (n, 2, 6) wrench of each arm on the box [N, N m].
+        """
         sampled, model = self.sampled, _model(self.workcell)
         matrices = model.wrench_torque(np.ascontiguousarray(sampled.q), sampled.pose)
         first = len(self.job.joint_names[0])
         return contact_torque(first, matrices, np.swapaxes(wrench, 0, 1))
 
     def _of_other(self, contact: Array) -> Array:
-        """Return, for joints that move both arms, the torque (n, joints) that the other arm's
-        contact causes in the joint; zero for other joints."""
+        """Return the torques that each arm's contact causes in the joints that move both arms,
+        moved to the columns of the other arm; zero for other joints.
+
+        Args:
+            contact: (n, joints) torques of each arm's own contact, both arms side by side [N m].
+        """
         found, (own, other) = np.zeros_like(contact), self.job.joint_names
         for name in common_joints(self.workcell.robots):
             both = [own.index(name), len(own) + other.index(name)]
@@ -474,8 +499,9 @@ class Export:
 
     @property
     def joint_columns(self) -> dict[str, Array]:
-        """Arrays (n, joints) by name: joint positions, velocities, accelerations, and torques with
-        and without gravity."""
+        """Arrays (n, joints) of both arms side by side, by name: joint positions, velocities,
+        accelerations [rad or m, and s], and torques with and without gravity [N m, for sliding
+        joints N]."""
         sampled = self.sampled
         return {
             "position": sampled.q,
@@ -487,7 +513,7 @@ class Export:
 
     @cached_property
     def gripped(self) -> Array:
-        """(n,) 1 at samples at which the outputs of hands are on, else 0."""
+        """(n,) 1 at samples at which hands are switched on, else 0."""
         found = np.zeros(len(self.sampled.time))
         for index, phase in enumerate(self.job.phases):
             if phase.name in SWITCHES:
@@ -496,7 +522,7 @@ class Export:
 
     @cached_property
     def limits(self) -> Limits:
-        """Limits at which programs stop the job."""
+        """Deviations from the plan at which the programs stop the job."""
         held = [phase.force for phase in self.job.held]
         spare = min(float(((f.normal - f.least) / f.normal).min()) for f in held)
         k = self.stiffness
@@ -515,10 +541,10 @@ class Export:
 
     @cached_property
     def partner_stop(self) -> PartnerStop:
-        """What one arm's stop costs.
+        """Effect of an unplanned stop of one arm.
 
         Raises:
-            JobError: more than the cell allows.
+            JobError: the pads would move farther apart than the cell allows.
         """
         # An arm that stands is noticed where it is `behind`, often sooner by what the arms are
         # apart; half of a stop's time passes at the planned speed.
@@ -538,8 +564,8 @@ class Export:
         return found
 
     def reach(self, arm: int) -> Array:
-        """Return for each joint (n_joints,) the largest motion of an arm's pad per unit of joint
-        motion at any sample [m/rad or 1]."""
+        """Compute for each joint the largest speed of the arm's pad per joint speed, over all
+        samples (n_joints,) [m/rad, for sliding joints 1]."""
         J = pad_jacobians(self.workcell, arm, self.sampled.arm(arm, self.sampled.q))
         return np.asarray(np.linalg.norm(J[:, :3], axis=1).max(axis=0))
 
@@ -550,7 +576,7 @@ class Export:
 
     @cached_property
     def document(self) -> dict[str, Any]:
-        """The content of job.json."""
+        """Content of job.json as JSON values."""
         sampled, job = self.sampled, self.job
         orientation = self.workcell.task.orientation
         spans = map(sampled.span, range(len(job.phases)))
@@ -592,7 +618,8 @@ class Export:
         }
 
     def tool_load(self, arm: int) -> tuple[float, Array]:
-        """Return the tool's mass [kg] and its centre (3,) in the flange's frame [m]."""
+        """Return the mass [kg] and the centre of mass (3,) in the flange frame [m] of an arm's
+        tool; zeros if unknown."""
         load = self.workcell.robots[arm].tool_load
         return (0.0, np.zeros(3)) if load is None else (load.mass, load.centre_of_mass)
 

@@ -14,7 +14,11 @@ def program(name: str) -> str:
 
 
 def filled(name: str, **values: object) -> str:
-    """Return the text of a template file with values in place of its $names.
+    """Return the text of a template file, in which each `$name` is replaced by the value of that
+    name.
+
+    Args:
+        name: path of the template.
 
     Raises:
         KeyError: a value is missing.
@@ -27,6 +31,9 @@ SHARED = ("bring_up.py", "carry_job.py", "carry_machine.py")
 
 
 def programs(name: str) -> dict[str, str]:
-    """Return the texts of the program `name` that runs a job and of those that it imports, by
-    path."""
+    """Return the texts of a program that runs a job and of the modules that it imports, by path.
+
+    Args:
+        name: name of the program.
+    """
     return {each: program(each) for each in (name, *SHARED)}

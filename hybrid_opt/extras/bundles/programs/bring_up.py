@@ -63,16 +63,17 @@ BLOCK = "put a block as wide as the box where the box stands at the start; then 
 
 @dataclass(frozen=True)
 class Measured:
-    """Measured values of an arm; nan for values on which the job does not depend.
+    """Measured properties of an arm; NaN for those on which the job does not depend.
 
     Attributes:
-        lag: delay behind the commands [s].
-        late: part of the lag that is not compensated [s]; it has to be the same for both arms.
-        speed: largest speed of the pad over the planned one.
-        offset: reading of the force sensor in the air [N].
-        sign: sign of its reading when the pad presses.
-        stiffness: stiffness of each arm at its pad, if both act in series [N/m].
-        press: measured over commanded force.
+        lag: delay of the arm behind its commands [s].
+        late: part of this delay that remains although commands are sent ahead [s]; it has to be
+            equal for both arms.
+        speed: largest measured speed of the pad over the largest planned speed.
+        offset: reading of the force sensor while nothing touches the arm [N].
+        sign: sign of the sensor's reading when the pad presses, 1 or -1.
+        stiffness: stiffness of each arm at its pad, with both arms in series [N/m].
+        press: measured force over commanded force.
     """
 
     lag: float
@@ -85,8 +86,8 @@ class Measured:
 
 
 def unloaded(job: Job) -> Job:
-    """Return the job without forces and with hands that stay off, for a run without a box; the
-    limits on delays are wider."""
+    """Return the job without contact forces, with hands that stay off and with wider limits on
+    delays, for a run without a box."""
     robots = []
     for robot in job.robots:
         contact = robot["hold_effort_without_gravity"]
@@ -105,7 +106,7 @@ def unloaded(job: Job) -> Job:
 
 
 def pressing(job: Job) -> Job:
-    """Return the part of a job up to the end of the phase that presses, slowed down."""
+    """Return the part of a job up to the end of the phase `press`, slowed down."""
     count = 1 + next(i for i, each in enumerate(job.document["phases"]) if each["name"] == "press")
     phases = job.document["phases"][:count]
     end = phases[-1]["last"] + 1
@@ -130,13 +131,13 @@ def _lists(robot: dict[str, Any]) -> Iterator[tuple[str, list[Any]]]:
 
 @dataclass(frozen=True)
 class Look:
-    """One measurement of moving arms.
+    """One measurement of both moving arms.
 
     Attributes:
-        time: of the measurement [s].
-        s: commanded coordinate [s].
-        direction: direction along the path, 1 or -1.
-        age: age of each arm's posture [s].
+        time: time of the measurement [s].
+        s: commanded coordinate of the job: planned time along its path [s].
+        direction: rate of the coordinate, 1 forward or -1 back.
+        age: time since each arm's posture was measured [s].
         q: joint positions of each arm [rad or m].
     """
 
@@ -152,10 +153,11 @@ class Looks:
     """All measurements of both arms.
 
     Attributes:
-        moving: measurements in the air.
-        forces: raw readings of each arm's sensor in the air [N].
-        pressed: for each measurement while a block is pressed: time, distance of the pressing pad
-            beyond its planned position [m], commanded force, and raw readings [N].
+        moving: measurements while the arms move without touching anything.
+        forces: raw readings of each arm's force sensor while nothing touches it [N].
+        pressed: one entry per measurement while a block is pressed: time [s], distance of the
+            pressing pad beyond its planned position [m], commanded force [N], and raw reading of
+            each sensor [N].
     """
 
     moving: list[Look] = field(default_factory=list)
@@ -165,14 +167,14 @@ class Looks:
     def note(
         self, now: float, machine: Machine, seen: Seen, raw: list[float | None], way: float = nan
     ) -> None:
-        """Store a measurement.
+        """Store a measurement, if the job runs at a constant rate.
 
         Args:
-            now: time [s].
+            now: time of the measurement [s].
             machine: state of the job.
             seen: measured state of the arms.
-            raw: readings of both sensors [N]; None without a sensor.
-            way: distance of the pressing pad beyond its planned position [m].
+            raw: reading of each arm's force sensor [N]; None without a sensor.
+            way: distance of the pressing pad beyond its planned position [m]; NaN if unknown.
         """
         clock, job = machine.clock, machine.job
         if machine.state != "running" or clock.turning:
@@ -189,11 +191,13 @@ class Looks:
             self.moving.append(Look(now, clock.s, clock.rate, seen.age, q))
 
     def offset(self, arm: int) -> float:
-        """Return the reading of an arm's sensor in the air [N], nan without a sensor."""
+        """Return the median reading of an arm's force sensor while nothing touches the arm [N]; NaN
+        without readings."""
         return median(self.forces[arm]) if self.forces[arm] else nan
 
     def speed(self, job: Job, arm: int) -> float:
-        """Return the largest speed of a pad over the planned one."""
+        """Return the largest measured speed of an arm's pad, over the largest planned speed of that
+        pad."""
         reach, found = job.robots[arm]["reach"], [0.0]
         for one, other in zip(self.moving, self.moving[WINDOW:], strict=False):
             passed = other.time - other.age[arm] - one.time + one.age[arm]
@@ -205,7 +209,8 @@ class Looks:
         return max(found) / max(planned)
 
     def late(self, job: Job, arm: int) -> float:
-        """Return the delay of an arm behind the clock [s]."""
+        """Return the median delay of an arm's measured posture behind the commanded coordinate
+        [s]."""
         fastest, found = max(job.speed(arm, s) for s in job.time), []
         for look in self.moving:
             forward = look.direction
@@ -217,10 +222,17 @@ class Looks:
         return median(found) if found else nan
 
     def contact(self, arm: int, lag: float) -> dict[str, float]:
-        """Return sign, stiffness and press of an arm with a sensor, whose lag is known [s].
+        """Evaluate the readings of an arm's force sensor while a block was pressed.
+
+        Args:
+            arm: index of the arm.
+            lag: delay of the arm behind its commands [s].
+
+        Returns:
+            The attribute `sign` of `Measured`, and either `stiffness` or `press`.
 
         Raises:
-            Refused: nothing presses back.
+            Refused: no force was measured.
         """
         readings = [(t, way, wanted, raw[arm]) for t, way, wanted, raw in self.pressed]
         known = [(*rest, raw - self.offset(arm)) for *rest, raw in readings if raw is not None]
@@ -243,7 +255,13 @@ class Looks:
         return {"sign": sign, "stiffness": 2.0 * slope}
 
     def measured(self, job: Job, arm: int, lead: float) -> Measured:
-        """Return the measured values of an arm whose commands are sent ahead by `lead` [s]."""
+        """Return the measured properties of an arm.
+
+        Args:
+            job: the job that was run.
+            arm: index of the arm.
+            lead: time by which the arm's commands are sent ahead [s].
+        """
         late = self.late(job, arm)
         found = Measured(lead + late, late, self.speed(job, arm))
         if not self.forces[arm] or not self.pressed:
@@ -253,8 +271,8 @@ class Looks:
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """Add the options for what a program does instead of the job: check, drive in the air, or
-    measure."""
+    """Add options to a program that runs a job: check only, move without a box, or measure both
+    arms."""
     group = parser.add_mutually_exclusive_group()
     for name, text in (
         ("--check", "look at both arms and move nothing"),
@@ -267,15 +285,15 @@ def add_options(parser: ArgumentParser) -> None:
 def bring_up(
     folder: Path, job: Job, plan: dict[str, Any], drive: Callable[[Job, str], bool], looks: Looks
 ) -> int:
-    """Measure both arms and write the results. Return the exit code.
+    """Measure both arms and write the results into a bundle's folder. Return the exit code.
 
     Args:
         folder: folder of the bundle.
         job: the job.
-        plan: planned values from the bundle's configuration.
-        drive: function that drives a job to its end and back after somebody has typed a word, and
-            fills `looks`.
-        looks: measurements.
+        plan: planned values, as in the configuration of the bundle.
+        drive: function that runs a job to its end and back once somebody has typed the given word,
+            stores measurements in `looks`, and returns True if the run was completed.
+        looks: store of the measurements.
 
     Raises:
         Refused: a measurement fails.
@@ -303,7 +321,11 @@ def bring_up(
 
 
 def require(folder: Path, job: Job, plan: dict[str, Any]) -> list[Measured]:
-    """Return the measured values of both arms.
+    """Read the measured properties of both arms from a bundle's folder and compare them with the
+    plan.
+
+    Args:
+        plan: planned values, as in the configuration of the bundle.
 
     Raises:
         Refused: nothing was measured, or a value differs too much from the plan.

@@ -40,19 +40,20 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Limits:
-    """Limits from the job's file at which the job is stopped.
+    """Deviations from the plan at which a program stops the job, as in the job's file.
 
     Attributes:
         stop_time: duration of a stop along the path from the planned speed [s].
-        quick_stop: duration of a stop if an arm does not follow its commands [s].
+        quick_stop: duration of a stop from the planned speed if an arm does not follow its commands
+            [s].
         start: largest distance of a pad from its first position [m].
-        path: largest distance of a pad from its path [m].
-        behind: largest time that an arm may lag behind its reference [s].
-        skew: largest difference between both arms along the path [s].
-        force: largest deviation of a measured force from its reference while the box is held, as a
-            share.
-        silence: largest age of a measurement [s].
-        grip: longest wait for the inputs of hands [s].
+        path: largest distance of a pad from its planned path [m].
+        behind: largest delay of an arm behind its reference [s].
+        skew: largest difference between the coordinates of both arms along the path [s].
+        force: largest deviation of a measured force from its reference while the box is held, over
+            the reference.
+        silence: longest time since an arm's last measurement [s].
+        grip: longest wait for inputs to report that hands hold or are open [s].
     """
 
     stop_time: float
@@ -68,10 +69,10 @@ class Limits:
 
 @dataclass(frozen=True)
 class Switch:
-    """A phase in which hands are switched.
+    """A phase of a job in which hands are switched on or off.
 
     Attributes:
-        begin, end: coordinates of the phase [s].
+        begin, end: first and last coordinate of the phase, as planned time [s].
         on: True if the hands are switched on when the job runs forward.
     """
 
@@ -81,12 +82,12 @@ class Switch:
 
 
 class Job:
-    """A job read from its file.
+    """A job read from its file. A place on its path is given by a coordinate: the planned time [s].
 
     Attributes:
-        document: JSON values of the file.
-        time: planned time of each sample [s].
-        robots: each arm's part of the document.
+        document: content of the file as JSON values.
+        time: coordinate of each sample [s].
+        robots: part of the document for each arm.
         limits: limits at which the job is stopped.
     """
 
@@ -126,7 +127,7 @@ class Job:
 
     @cached_property
     def fastest(self) -> float:
-        """Largest speed of the first arm's pad [m/s]."""
+        """Upper bound of the first arm's pad speed over the whole path [m/s]."""
         return max(self.speed(0, s) for s in self.time)
 
     @property
@@ -149,11 +150,14 @@ class Job:
         return self.end
 
     def is_touching(self, s: float) -> bool:
-        """Return True if the box may already stand at a coordinate s [s].
+        """Return True if the box may already stand on its support although the set-down is not
+        finished.
 
-        This is so if s is in the set-down and the planned position of the box is at most `TOUCH`
-        from its position at the end of the set-down. Once `is_standing` is true, the result is
-        False.
+        This is so if s is in the set-down, the planned place of the box is at most `TOUCH` from the
+        one at the end of the set-down, and `stand` has not been called.
+
+        Args:
+            s: coordinate [s].
         """
         if self.phase(s) != "set_down" or self.is_standing:
             return False
@@ -163,14 +167,14 @@ class Job:
         return math.dist(last, list(here)[:3]) <= TOUCH
 
     def stand(self, s: float, q: Sequence[Sequence[float] | None]) -> None:
-        """Shift the release and all later phases to a coordinate of the set-down, because the box
-        already stands there.
+        """Let the release begin at a place within the set-down, because the box stands already. All
+        later references are shifted accordingly.
 
         While the commanded forces decrease, the references of the arms move to the measured
-        positions, so that soft arms release the box too.
+        positions. So soft arms release the box too.
 
         Args:
-            s: coordinate of the set-down [s].
+            s: coordinate in the set-down at which the box stands [s].
             q: measured joint positions of each arm [rad or m]; None if unknown.
         """
         end, self._early = self.begin("release"), None
@@ -192,12 +196,17 @@ class Job:
         return min(self.begin(name) for name in HELD)
 
     def is_gripped(self, s: float) -> bool:
-        """Return True if the pads touch the box at a coordinate [s] before it is lifted."""
+        """Return True if the pads touch the box at a coordinate s [s] but the box is not lifted
+        yet."""
         return self._phases[0][0] < s <= self.pressed
 
     def grips(self, s: float, direction: float) -> bool:
-        """Return True if hands are switched on at a coordinate [s]. `direction` is 1 on the way
-        forward and -1 on the way back."""
+        """Return True if hands are to be switched on at a coordinate.
+
+        Args:
+            s: coordinate [s].
+            direction: 1 if the job runs forward, -1 if it runs back.
+        """
         passed = [
             switch.on
             for switch in self.switches
@@ -206,19 +215,24 @@ class Job:
         return passed[-1] if passed else False
 
     def holds(self, s: float) -> bool:
-        """Return True if hands have to hold the box at a coordinate [s], in both directions."""
+        """Return True if hands have to hold the box at a coordinate [s], whether the job runs
+        forward or back."""
         return self.grips(s, 1.0) and self.grips(s, -1.0)
 
     def _place(self, s: float) -> tuple[int, float, float]:
-        """Return the index of the sample before coordinate s [s], the share of the interval that is
-        passed, and the length of the interval [s]."""
+        """Find the interval between two samples that contains a coordinate s [s].
+
+        Returns:
+            Index of the sample before s, passed share of the interval in [0, 1], and length of the
+            interval [s].
+        """
         k = min(max(bisect_right(self.time, s) - 1, 0), len(self.time) - 2)
         step = self.time[k + 1] - self.time[k]
         return k, min(max((s - self.time[k]) / step, 0.0), 1.0), step
 
     def position(self, arm: int, s: float) -> list[float]:
-        """Return the joint positions of an arm at a coordinate [s], cubic between samples [rad or
-        m]."""
+        """Interpolate the planned joint positions of an arm at a coordinate s [s], by cubic
+        polynomials [rad, or m for sliding joints]."""
         k, x, step = self._place(s)
         q, v = self.robots[arm]["position"], self.robots[arm]["velocity"]
         a, b = (1.0 + 2.0 * x) * (1.0 - x) ** 2, x * (1.0 - x) ** 2 * step
@@ -235,8 +249,11 @@ class Job:
         return found
 
     def linear(self, arm: int, name: str, s: float) -> list[float]:
-        """Return values of an arm at a coordinate [s], linear between samples. `name` is the key of
-        the values in the arm's part of the document."""
+        """Interpolate values of an arm at a coordinate s [s] linearly between samples.
+
+        Args:
+            name: key of the values in the arm's part of the document.
+        """
         k, x, _ = self._place(s)
         rows = self.robots[arm][name]
         return [(1.0 - x) * a + x * b for a, b in zip(rows[k], rows[k + 1], strict=True)]
@@ -248,36 +265,48 @@ class Job:
         return float((1.0 - x) * rows[k] + x * rows[k + 1])
 
     def effort(self, arm: int, gravity: str, s: float, rate: float) -> list[float]:
-        """Return the joint torques of an arm at a coordinate and rate [N m, for sliding joints N].
-
-        Torques of the motion scale with the square of the rate; torques that hold and press do not.
+        """Return the planned joint torques of an arm at a coordinate, adapted to the rate at which
+        the job runs [N m, for sliding joints N].
 
         Args:
             arm: index of the arm.
-            gravity: 'with_gravity' or 'without_gravity'.
+            gravity: 'with_gravity' or 'without_gravity': whether the torques include the arm's
+                weight.
             s: coordinate [s].
-            rate: rate of the coordinate over time.
+            rate: derivative of the coordinate with respect to time; 1 at the planned speed.
         """
         moving = self.linear(arm, f"effort_{gravity}", s)
         holding = self.linear(arm, f"hold_effort_{gravity}", s)
         return [b + (a - b) * rate * rate for a, b in zip(moving, holding, strict=True)]
 
     def distance(self, arm: int, q: Sequence[float], s: float) -> float:
-        """Return an upper bound of the distance between the pad in a posture q and the pad's place
-        at coordinate s [m]."""
+        """Return an upper bound of the distance between an arm's pad and its planned place [m].
+
+        Args:
+            arm: index of the arm.
+            q: joint positions of the arm [rad or m].
+            s: coordinate of the planned place [s].
+        """
         reach = self.robots[arm]["reach"]
         planned = self.position(arm, s)
         return float(sum(r * abs(a - b) for r, a, b in zip(reach, q, planned, strict=True)))
 
     def speed(self, arm: int, s: float) -> float:
-        """Return an upper bound of the speed of an arm's pad at coordinate s [m/s]."""
+        """Return an upper bound of the planned speed of an arm's pad at a coordinate s [s], in
+        m/s."""
         rates = self.linear(arm, "velocity", s)
         reach = self.robots[arm]["reach"]
         return float(sum(r * abs(v) for r, v in zip(reach, rates, strict=True)))
 
     def _project(self, arm: int, q: Sequence[float], s: float) -> float:
-        """Return the coordinate of an arm on its path that is nearest to a posture q, by one
-        Gauss-Newton step from s [s]."""
+        """Estimate the coordinate at which an arm's path is nearest to a posture, by one
+        Gauss-Newton step [s].
+
+        Args:
+            arm: index of the arm.
+            q: joint positions of the arm [rad or m].
+            s: coordinate from which the step is made [s].
+        """
         planned, rates = self.position(arm, s), self.linear(arm, "velocity", s)
         rows = zip(self.robots[arm]["reach"], q, planned, rates, strict=True)
         fit = [(r * r * (a - b) * v, r * r * v * v) for r, a, b, v in rows]
@@ -294,15 +323,15 @@ class Job:
         window: tuple[float, float],
         near: float = NEAR,
     ) -> float:
-        """Return the coordinate that fits a posture best [s]; among equally good ones, the nearest
-        to s.
+        """Find the coordinate at which the planned posture of an arm is nearest to a measured one
+        [s]. Of equally near places the one nearest to s is returned.
 
         Args:
             arm: index of the arm.
             q: measured joint positions [rad or m].
-            s: coordinate about which is searched [s].
-            window: how far the result may be before and behind s [s].
-            near: largest distance of the pad from its place at s with which s itself is returned
+            s: coordinate around which to search [s].
+            window: least and largest difference of the result from s [s].
+            near: if the pad is at most this far from its planned place at s, s itself is returned
                 [m].
         """
         if self.distance(arm, q, s) <= near:

@@ -41,8 +41,14 @@ STRIKES = 3
 
 @dataclass(frozen=True)
 class Moment:
-    """State of the path at a future time: time from now, coordinate, rate, and derivative of the
-    rate."""
+    """Future state of a job on its path.
+
+    Attributes:
+        time: time from now [s].
+        s: coordinate, the planned time of the place on the path [s].
+        rate: derivative of the coordinate with respect to time.
+        change: derivative of the rate with respect to time [1/s].
+    """
 
     time: float
     s: float
@@ -51,22 +57,30 @@ class Moment:
 
 
 class Clock:
-    """The coordinate of the path and its rate.
+    """The commanded place on the path of a job, and how fast it moves. The place is given by a
+    coordinate, its planned time.
 
     Attributes:
-        s: commanded coordinate of both arms [s].
-        rate: derivative of s by time.
+        s: coordinate of both arms [s].
+        rate: derivative of s with respect to time: 1 at the planned speed, 0 at rest, -1 backwards.
     """
 
     def __init__(self, end: float, stop_time: float, s: float = 0.0, rate: float = 0.0) -> None:
-        """Start at a coordinate, with a rate."""
+        """Start at a coordinate with a rate.
+
+        Args:
+            end: last coordinate of the path [s].
+            stop_time: duration of a change of the rate by 1 [s].
+            s: first coordinate [s].
+            rate: first rate.
+        """
         self.s, self.rate, self._stop_time = s, rate, stop_time
         self._low, self._high = 0.0, end
         self._takes = stop_time
         self._from, self._to, self._since = rate, rate, 0.0
 
     def keep(self, low: float, high: float) -> None:
-        """Limit the coordinate to a range from now on [s]."""
+        """Limit the coordinate to the range from `low` to `high` [s]."""
         self._low, self._high = low, high
 
     @property
@@ -78,9 +92,9 @@ class Clock:
         """Start a smooth change of the rate.
 
         Args:
-            rate: the new rate.
+            rate: rate after the change.
             after: time until the change begins [s].
-            takes: duration of a change of the rate by one [s]; None for the stop time.
+            takes: duration of a change of the rate by 1 [s]; None for the stop time of the clock.
         """
         if rate != self._to:
             self._from, self._to, self._since = self.rate, rate, -after
@@ -106,7 +120,7 @@ class Clock:
 
     @property
     def _share(self) -> float:
-        """Share of the change of the rate that is done."""
+        """Finished share of the present change of the rate, in [0, 1]."""
         return min(max(self._since / (self._takes * abs(self._to - self._from)), 0.0), 1.0)
 
     @property
@@ -119,7 +133,13 @@ class Clock:
         return sign * 30.0 * x * x * (1.0 - x) ** 2 / self._takes
 
     def ahead(self, rate: float, step: float) -> Iterator[Moment]:
-        """Yield the future states in time steps, turning to a rate, until the clock stands."""
+        """Yield the states from now on if the rate changes to a given one, until the coordinate
+        moves no more.
+
+        Args:
+            rate: rate after the change.
+            step: time between two states [s].
+        """
         clock = copy(self)
         clock.turn(rate)
         yield Moment(0.0, clock.s, clock.rate, clock.change)
@@ -133,15 +153,15 @@ class Clock:
 
 @dataclass
 class Seen:
-    """Measured state of the arms at one time.
+    """Measured state of both arms at one time.
 
     Attributes:
         q: joint positions of each arm [rad or m]; None if unknown.
-        force: normal force of each pad [N]; None if not measured.
-        age: age of each arm's posture [s].
-        grip: for each arm, True if the input of its hands reports that they hold; None if unknown.
-        fault: reason to stop, '' for none.
-        lost: True if the reason is an arm that does not follow its commands.
+        force: normal force of each arm's pad [N]; None if not measured.
+        age: time since each arm's posture was measured [s].
+        grip: for each arm, True if an input reports that its hands hold; None if unknown.
+        fault: reason why the job has to stop, '' for none.
+        lost: True if an arm does not follow its commands.
     """
 
     q: list[list[float] | None] = field(default_factory=lambda: [None, None])
@@ -153,17 +173,19 @@ class Seen:
 
 
 class Machine:
-    """Runs a job through the states `ready`, `running`, `stopping`, `held` and `done`. In the state
-    `landing` it stops where the box stands before the end of its set-down, and continues with the
-    release there.
+    """State machine of a job, with the states `ready`, `running`, `stopping`, `landing`, `held` and
+    `done`.
+
+    In the state `landing` the arms stop where the box stands before the planned end of its
+    set-down. The release then begins there.
 
     Attributes:
         state: the present state.
         reason: reason of the last stop.
-        clock: coordinate of the path.
+        clock: commanded place on the path.
         stop_time: duration of the present stop, or of the last one [s].
-        opened: True if the last check found that the hands do what was commanded, so that the clock
-            continues.
+        opened: True if the last check found all hands as commanded, so that a waiting clock may
+            continue.
     """
 
     def __init__(
@@ -178,10 +200,10 @@ class Machine:
 
         Args:
             job: the job.
-            lag: delay of the arms behind their commands [s].
-            lead: time from the decision to stop to its effect on the commands [s].
-            sensors: per arm, True if its force must be measured.
-            inputs: per arm, True if an input must report whether its hands hold.
+            lag: delay of both arms behind their commands [s].
+            lead: time between the decision to stop and the first changed command [s].
+            sensors: for each arm, True if its force must be measured.
+            inputs: for each arm, True if an input must report whether its hands hold.
         """
         self.job, self.lag, self.lead, self._sensors = job, lag, lead, sensors
         self.state, self.reason = "ready", ""
@@ -193,6 +215,9 @@ class Machine:
     def start(self, seen: Seen) -> None:
         """Begin the job.
 
+        Args:
+            seen: measured state of both arms.
+
         Raises:
             Refused: a stop is requested, an arm is silent or not at its first position, a sensor
                 gives no reading, or a pad is pressed.
@@ -203,10 +228,14 @@ class Machine:
         self._aim(1.0)
 
     def check(self, seen: Seen) -> None:
-        """Check that the arms are ready for the job.
+        """Check that both arms are ready for the job.
+
+        Args:
+            seen: measured state of both arms.
 
         Raises:
-            Refused: they are not, for a reason that `start` names.
+            Refused: a stop is requested, an arm is silent or not at its first position, a sensor
+                gives no reading, or a pad is pressed.
         """
         if seen.fault:
             raise Refused(seen.fault)
@@ -248,12 +277,16 @@ class Machine:
 
     @property
     def grip(self) -> bool:
-        """True if the outputs of hands have to be on, as soon as the job has begun."""
+        """True if hands have to be switched on at the present place of a begun job."""
         return self.job.grips(self.clock.s, self._direction)
 
     def _aim(self, direction: float) -> None:
-        """Determine the coordinates ahead at which the clock has to wait for the inputs of
-        hands."""
+        """List the coordinates ahead at which the clock has to wait until inputs report the state
+        of hands, and limit the clock to the first.
+
+        Args:
+            direction: 1 forward, -1 back.
+        """
         self._direction, s, found = direction, self.clock.s, self.job.switches
         gates = [switch.end for switch in found if switch.end >= s]
         if direction < 0.0:
@@ -262,7 +295,7 @@ class Machine:
         self._next_gate()
 
     def _next_gate(self) -> None:
-        """Let the clock run to the next of these coordinates."""
+        """Let the clock run to the next coordinate at which it has to wait for hands."""
         self._waited = 0.0
         low, high = 0.0, self.job.end
         if self._gates and self._direction > 0.0:
@@ -322,8 +355,12 @@ class Machine:
                 self.hold(str(error))
 
     def _lands(self, force: str) -> bool:
-        """Return True if a wrong force in the last part of the set-down means that the box stands.
-        The arms then stop there, unless the release begins sooner."""
+        """Return True if a wrong force means that the box stands already in the last part of its
+        set-down. The arms then stop there, unless the release begins sooner.
+
+        Args:
+            force: reason why the measured forces are wrong, '' if they are right.
+        """
         if not self.job.is_touching(self.clock.s):
             return False
         # Slow arms can stop sooner, and press less until then.
@@ -335,7 +372,12 @@ class Machine:
         return True
 
     def stop(self, reason: str, quick: bool = False) -> None:
-        """Stop along the path and hold; quickly if an arm does not follow its commands."""
+        """Stop along the path and hold the posture there.
+
+        Args:
+            reason: reason of the stop.
+            quick: True if an arm does not follow its commands, for a shorter stop.
+        """
         if self.state == "running":
             self.state, self.reason = "stopping", reason
             limits = self.job.limits
@@ -343,7 +385,7 @@ class Machine:
             self.clock.turn(0.0, self.lead, self.stop_time)
 
     def told(self) -> str:
-        """Return a text on the state, and on how to continue."""
+        """Return a text that says in which state the job is, and how to continue."""
         where = f"{self.job.phase(self.clock.s)}, {self.clock.s:.3f} s"
         if self.state == "landing":
             return f"the box stands in {where}: {self.reason}. Both arms let go of it there"
