@@ -61,13 +61,14 @@ FLOOR = 1e-9
 
 @dataclass(frozen=True)
 class HandPatch:
-    """Lengths of a hand's patch.
+    """Lengths of a hand's contact patch, which enter the conditions (1) and (2) of the module.
 
     Attributes:
-        kern: shifts along both axes of the hand at which the pressure at a rim vanishes [m].
+        kern: shifts of the centre of pressure along the hand's x and y axes at which the pressure
+            at a rim vanishes [m].
         is_round: True for a disc or a ring.
-        twist: length c in (2) [m].
-        kappa: coefficient kappa in (2).
+        twist: mean distance c of the patch's points from its centre [m].
+        kappa: coefficient kappa of (2), dimensionless.
     """
 
     kern: tuple[Expression, Expression]
@@ -77,7 +78,8 @@ class HandPatch:
 
     @classmethod
     def of(cls, hand: Contact) -> HandPatch:
-        """Return the patch of a hand. Its lengths are symbols if those of the hand are."""
+        """Return the patch of the contact `hand`. Its lengths are symbols if the contact's lengths
+        are symbols."""
         is_round = hand.half_sides is None
         twist = hand.patch_radius if hand.is_ring else SoftPatch.of(hand, np.eye(3)).twist
         kappa: Expression = KAPPA_RING if hand.is_ring else KAPPA_DISC
@@ -91,12 +93,14 @@ class HandPatch:
 def required_holding_forces(
     wrench: Expression, friction: Expression, patch: HandPatch
 ) -> tuple[Expression, Expression]:
-    """Compute the holding forces of a hand that (1) and (2) require [N]. They are negative if the
-    load presses the hand on strongly enough.
+    """Compute the least holding force [N] that keeps a hand's rim from lifting off (1), and the
+    least that keeps the hand from sliding (2).
+
+    Both are negative if the load presses the hand onto the payload strongly enough.
 
     Args:
-        wrench: (6,) wrench of the hand on the payload, along the hand's axes: T, N, M_x, M_y, tau
-            [N, N m].
+        wrench: (6,) wrench of the hand on the payload about the hand's origin, along the hand's
+            axes: T (2,), N [N], M_x, M_y, tau [N m].
         friction: Coulomb coefficient of the hand.
         patch: patch of the hand.
     """
@@ -115,15 +119,18 @@ def _length(*components: Expression) -> Expression:
 
 def internal_force_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Array:
     """Compute the additional holding force of each hand per newton with which the arms push against
-    each other, for the worst direction.
+    each other.
 
-    An error of the arms' relative pose makes the arms push against each other; the layers of both
-    arms are springs in series. Bounds over all directions are summed, so the result is an upper
-    bound.
+    The push results from an error of the arms' relative pose; the elastic layers of the two arms
+    are springs in series. The result is an upper bound over all directions of the push.
+
+    Args:
+        pads: the n hands of both arms.
+        robots: index of the arm of each hand.
 
     Returns:
-        (n, 3) for each hand a and b, which give a / mu + b against sliding, and the force against
-        lifting [1].
+        (n, 3) numbers a, b, c for each hand, dimensionless: a / mu + b is the additional holding
+        force against sliding, with friction mu, and c the one against lifting off.
     """
     maps, stiff = [wrench_to_box(pad) for pad in pads], [layer_stiffness(pad) for pad in pads]
     wholes = [np.zeros((6, 6)), np.zeros((6, 6))]
@@ -144,13 +151,12 @@ def internal_force_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Arra
 
 
 class HoldingHands(ContactModel):
-    """Contact model of hands of both arms, any number and with any normals.
+    """Contact model of hands (cups, magnets, grippers) on both arms, of any number and with any
+    normals.
 
-    The normal force of an arm stands for the largest holding force that any of its hands needs. It
-    is stated for the weaker hands: forces of stronger ones are multiplied by the weaker holding
-    force over their own, so that a force of either arm is the same share of what its hands have. In
-    worst cases the hands of both arms count together: no force is commanded, and one limit applies
-    to both arms.
+    The normal force of an arm is the largest holding force that any of the arm's hands needs, as a
+    share of the hand's own holding force, times the least holding force of all hands. No force is
+    commanded. In worst cases, one force limit applies to the hands of both arms together.
     """
 
     assumption = "hands that hold by themselves, on arms that keep their poses"
@@ -162,8 +168,8 @@ class HoldingHands(ContactModel):
 
     @property
     def pad_parameters(self) -> list[dict[str, Any]]:
-        """For each hand its matrix of `layer_shares`, its row of `internal_force_needs`, and the
-        least holding force of all hands over its own."""
+        """One dictionary per hand: its matrix (6, 6) of `layer_shares`, its row (3,) of
+        `internal_force_needs`, and the least holding force of all hands over the hand's own."""
         pads = self.workcell.pads
         if isinstance(pads[0], NumberedContact):
             return [{name: getattr(pad, name) for name in HAND_PARAMETERS} for pad in pads]
@@ -177,7 +183,8 @@ class HoldingHands(ContactModel):
 
     @property
     def problem(self) -> Problem | None:
-        """Key and message if a contact is a pad or the arms' holding forces differ, else None."""
+        """Key of the workcell file and message if a contact is a pad instead of a hand; else
+        None."""
         pads = [f"contacts[{i}]" for i, c in enumerate(self.workcell.contacts) if c.kind == "pad"]
         if pads:
             return (
@@ -189,7 +196,8 @@ class HoldingHands(ContactModel):
 
     @property
     def level_force(self) -> float:
-        """Holding force that a hand needs with the payload level and at rest [N]."""
+        """Largest holding force that any hand needs [N] if the payload is at rest in an upright box
+        frame."""
         payload, contacts = self.workcell.payload, self.workcell.contacts
         centre = payload.centre_of_mass
         load = ContactLoad(
@@ -207,10 +215,17 @@ class HoldingHands(ContactModel):
         implicit: ImplicitVariables | None = None,
         displaced: bool = False,
     ) -> HeldLoad:
-        """Return the holding forces that a load requires, with each hand's share of the load.
+        """Return the least holding forces for a load, and the wrench with which each arm's hands
+        balance it.
 
-        The tangential force is the part of the load that the holding force bears by friction, so it
-        never exceeds friction times the normal force.
+        In the result, `normal` is the least holding force of each arm's hands, and `tangential` the
+        part of the load that friction under the holding force must bear. So `tangential` never
+        exceeds friction times `normal`.
+
+        Args:
+            load: load on the hands of both arms.
+            implicit: not used.
+            displaced: not used.
         """
         workcell = self.workcell
         places = [number(contact.T_box_pad[:3, 3]) for contact in workcell.contacts]
@@ -250,42 +265,49 @@ class HoldingHands(ContactModel):
         )
 
     def friction_lost(self, apart: Array) -> Array:
-        """Return zero: without a squeeze, displacements (k,) of the hands cost no friction."""
+        """Return zeros (k,): displacements `apart` (k,) [m] of hands, which need no squeeze, cost
+        no friction."""
         return 0.0 * apart
 
     def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
-        """Return half-widths (3,) of the range of the centre of mass [m], enlarged by the hands'
-        displacements, and no displacements (1, 4): displaced hands shift the centre of mass
-        relative to them."""
+        """Return the worst displacements of the hands under an uncertainty.
+
+        Returns:
+            Half-widths (3,) of the range of the centre of mass along the box axes [m], enlarged by
+            the hands' displacements, because displaced hands shift the centre of mass relative to
+            them; and one case of zero displacements, (1, 4) [m].
+        """
         off = uncertainty.pad_position + uncertainty.apart / 2.0
         return uncertainty.centre_of_mass + off, np.zeros((1, 4))
 
     def leading_excess(self, load: ContactLoad, opposed: Expression) -> Expression:
-        """Return zero, because the hands of both arms count together."""
+        """Return zero: the hands of both arms have one common force limit."""
         return ca.SX(0.0)
 
     def commanded_forces(
         self, normal: Expression, friction: Expression, tracking: Expression, opposed: Expression
     ) -> Expression:
-        """Return the holding force (2,) that each arm's hands need [N]. Both entries are equal.
-
-        The force is stated for the weaker hands.
+        """Compute the holding force [N] that the hands of both arms need, stated for the hand with
+        the least holding force, as two equal entries (2,).
 
         Args:
             normal: (2,) least holding force of each arm's hands [N].
-            friction: (2,) Coulomb coefficients.
+            friction: (2,) Coulomb coefficients of the arms' hands.
             tracking: (2,) share of each arm's holding force that may be missing, for example of a
                 vacuum.
-            opposed: force with which the arms may work against each other [N].
+            opposed: force with which the arms may push against each other [N].
         """
         needed = ca.fmax(normal[0], normal[1]) + opposed * self._opposed_need(friction)
         needed /= 1.0 - ca.fmax(tracking[0], tracking[1])
         return ca.vertcat(needed, needed)
 
     def approach(self, arm: int) -> Array:
-        """Return the direction (3,) in which an arm's hands approach the payload, box frame. Hands
-        approach along their mean normal; fingers, whose normals cancel, across their normals from
-        outside."""
+        """Return the unit direction (3,) in which the hands of arm `arm` approach the payload, box
+        frame.
+
+        Hands approach along their mean normal. The normals of gripper fingers cancel, so fingers
+        approach across their normals, from outside.
+        """
         of_arm = zip(self.workcell.pads, self.workcell.pad_robots, strict=True)
         T = np.array([pad.T_box_pad for pad, robot in of_arm if robot == arm])
         normals, middle = T[:, :3, 2], T[:, :3, 3].mean(axis=0)
@@ -295,18 +317,35 @@ class HoldingHands(ContactModel):
         return np.asarray(way / np.linalg.norm(way))
 
     def held_with(self, commanded: Array) -> Array:
-        """Return the holding force (n, 2) of the weaker hands [N]. It does not depend on commanded
-        forces."""
+        """Return the least holding force of all hands [N], repeated to the shape (n, 2) of
+        `commanded`. It does not depend on commanded forces."""
         weakest = min(contact.holding_force for contact in self.workcell.contacts)
         return np.full(commanded.shape, weakest)
 
     def raised(self, planned: Array, extra: Array, leader: int) -> Array:
-        """Return the same force (n, 2) for the hands of both arms, which count together [N]."""
+        """Return the holding force of arm `1 - leader` raised by `extra`, once for each arm, (n, 2)
+        [N].
+
+        Args:
+            planned: (n, 2) planned holding forces [N].
+            extra: (n,) rise of the force [N].
+            leader: index of the leading robot.
+        """
         return np.repeat((planned[:, 1 - leader] + extra)[:, None], 2, axis=1)
 
     def pulled_apart(self, along: Array, across: Array, stiffness: float) -> tuple[Array, Array]:
-        """Return zero changes (n,) of the normal forces, and rises (n,) of the least forces, if the
-        arms are displaced against each other [N]. Each direction counts as the worst."""
+        """Compute how the forces change if the arms, as springs in series, are displaced against
+        each other.
+
+        Args:
+            along, across: (n,) displacements of one arm's hands along their normal and across it
+                [m].
+            stiffness: stiffness of each arm at its hands [N/m].
+
+        Returns:
+            Changes (n,) of the holding forces, which are zero, and rises (n,) of the least holding
+            forces for the worst direction of the displacement [N].
+        """
         friction = ca.DM([contact.friction for contact in self.workcell.contacts])
         most = float(ca.evalf(self._opposed_need(friction)))
         return 0.0 * along, stiffness / 2.0 * np.hypot(along, across) * most

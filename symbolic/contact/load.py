@@ -64,10 +64,11 @@ frame."""
 
 
 def load_function(workcell: Workcell) -> ca.Function:
-    """Build the function of contact forces and centres of pressure at one sample of the box motion.
+    """Build the function of the contact forces and centres of pressure at one sample of the box
+    motion.
 
-    Inputs: pose, rate, second_rate (6,), the box pose and its first and second time derivative.
-    Outputs: `LOAD_OUTPUTS`.
+    Inputs: pose, rate, second_rate (6,), the box pose [m, rad] and its first and second time
+    derivative; then the payload's symbolic parameters. Outputs: `LOAD_OUTPUTS`.
     """
     payload = workcell.payload
     own: list[Expression] = [frictions(workcell), ca.SX(number(payload.centre_of_mass))]
@@ -90,24 +91,26 @@ def frictions(workcell: Workcell) -> ca.SX:
 def resultant_force(
     mass: float, offset: ca.SX, omega: ca.SX, alpha: ca.SX, acceleration: ca.SX
 ) -> ca.SX:
-    """Compute the resultant force (3,) [N] on a rotating and accelerating box, world frame (Eq.
-    34).
+    """Compute the resultant force (3,) that a rotating and accelerating box needs, m (a - g), world
+    frame [N] (Eq. 34).
 
     Args:
         mass: mass of the payload [kg].
-        offset: (3,) from the box centre to the centre of mass, world axes [m].
-        omega, alpha: (3,) angular velocity and acceleration [rad/s, rad/s^2].
-        acceleration: (3,) acceleration of the box centre [m/s^2].
+        offset: (3,) vector from the box centre to the centre of mass, world axes [m].
+        omega, alpha: (3,) angular velocity and acceleration, world frame [rad/s, rad/s^2].
+        acceleration: (3,) acceleration of the box centre, world frame [m/s^2].
     """
     turning = ca.cross(alpha, offset) + ca.cross(omega, ca.cross(omega, offset))
     return required_force(mass, acceleration + turning)
 
 
 def uncertain_load_function(workcell: Workcell) -> ca.Function:
-    """Build the function of `load_function` with friction and centre of mass as further inputs.
+    """Build the function of contact forces at one sample, with friction and centre of mass as
+    inputs.
 
-    Inputs: pose, rate, second_rate (6,); friction (2,) coefficients of the contacts; centre_of_mass
-    (3,) in the box frame [m]. Outputs: `LOAD_OUTPUTS`.
+    Inputs: pose, rate, second_rate (6,), the box pose and its time derivatives; friction (2,), the
+    Coulomb coefficients; centre_of_mass (3,), box frame [m]; then the payload's symbolic
+    parameters. Outputs: `LOAD_OUTPUTS`.
     """
     if contact_model(workcell).has_closed_form:
         return _closed_load_function(workcell)
@@ -169,11 +172,17 @@ def _named(inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
 def required(
     workcell: Workcell, pose: ca.SX, rate: ca.SX, second: ca.SX, centre_of_mass: ca.SX | ca.DM
 ) -> list[ca.SX]:
-    """Compute the dynamics of the box.
+    """Compute the rotation of the box, and the force and moment that its motion requires.
+
+    Args:
+        workcell: cell with the payload.
+        pose, rate, second: (6,) box pose [m, rad] and its first and second time derivative.
+        centre_of_mass: (3,) box frame [m].
 
     Returns:
-        R_world_box (3, 3); then (3,) each, world axes: angular velocity, angular acceleration,
-        required force, and required moment about the centre of mass.
+        R_world_box (3, 3); then in the world frame, (3,) each: angular velocity [rad/s], angular
+        acceleration [rad/s^2], required force [N], and required moment about the centre of mass [N
+        m].
     """
     turned = workcell.task.orientation
     rotation = rotation_matrix(turned, pose[3:])
@@ -225,8 +234,12 @@ _ASKED = (("pose", 6), ("force", 3), ("moment", 3), ("centre_of_mass", 3))
 
 
 def box_load_function(workcell: Workcell) -> ca.Function:
-    """Build the function that converts a load in world axes to force and moment (6,) about the box
-    frame's origin, along the box's axes."""
+    """Build the function that converts the required force and moment to force and moment (6,) about
+    the box frame's origin, along the box's axes [N, N m].
+
+    Inputs: pose (6,); force (3,) and moment (3,) about the centre of mass, world axes;
+    centre_of_mass (3,), box frame [m].
+    """
     pose, force, moment, centre_of_mass = inputs = [ca.SX.sym(*entry) for entry in _ASKED]
     to_box = rotation_matrix(workcell.task.orientation, pose[3:]).T
     in_box = ca.mtimes(to_box, force)
@@ -235,8 +248,11 @@ def box_load_function(workcell: Workcell) -> ca.Function:
 
 
 def grasp_world_function(workcell: Workcell) -> ca.Function:
-    """Build the function from the inputs of `box_load_function` and the wrenches (6 k,) of k pads,
-    along the pads' axes, to `GRASP_OUTPUTS`."""
+    """Build the function that converts the wrenches of k pads to `GRASP_OUTPUTS` in world axes.
+
+    Inputs: pose, force, moment and centre_of_mass as in `box_load_function`; wrenches (6 k,), N, T
+    (2,), N d (2,), M of each pad along its axes [N, N m]; then the payload's symbolic parameters.
+    """
     pose, _, moment, centre_of_mass = inputs = [ca.SX.sym(*entry) for entry in _ASKED]
     pads, robots = workcell.pads, workcell.pad_robots
     wrenches = ca.SX.sym("wrenches", WRENCH_SIZE * len(pads))

@@ -32,12 +32,14 @@ Both = tuple[Expression, Expression]
 
 @dataclass(frozen=True)
 class ContactLoad:
-    """The load on two contacts. All vectors are along the same axes, for example the world's.
+    """Force and moment that two contacts have to balance. All vectors are along the same axes, for
+    example the world's.
 
     Attributes:
-        force, moment: (3,) force and moment that the contacts have to exert on the payload, about
-            its centre of mass [N, N m].
-        arms: (3,) each, from the centre of mass to the nominal contact points [m].
+        force, moment: (3,) force [N] and moment about the centre of mass [N m] that the contacts
+            exert together on the payload.
+        arms: for each contact the vector (3,) from the centre of mass to the nominal contact point
+            [m].
         axes: (3, 3) tangents and normal of contact 1 as columns.
         friction: (2,) Coulomb coefficients.
     """
@@ -51,15 +53,17 @@ class ContactLoad:
 
 @dataclass(frozen=True)
 class HeldLoad:
-    """The forces of two contacts that balance a load.
+    """Forces of two contacts that balance a load, along the axes of the load.
 
     Attributes:
         normal, tangential: (2,) normal forces and magnitudes of the tangential forces [N].
-        forces: (3,) each, contact forces on the payload [N].
-        shifts: (3,) each, shifts of the centres of pressure [m].
-        moments: (3,) each, contact moments on the payload about the nominal contact points [N m].
-        point_residual, residual: (3,) unbalanced moment with the forces at the nominal points
-            alone, and with `moments` added [N m].
+        forces: for each contact the force (3,) on the payload [N].
+        shifts: for each contact the shift (3,) of the centre of pressure [m].
+        moments: for each contact the moment (3,) on the payload about the nominal contact point [N
+            m].
+        point_residual: (3,) moment that `forces`, acting at the nominal points, leave unbalanced [N
+            m].
+        residual: (3,) moment that `forces` and `moments` together leave unbalanced [N m].
     """
 
     normal: Expression
@@ -72,15 +76,16 @@ class HeldLoad:
 
     @property
     def wrenches(self) -> Both:
-        """Force and moment (6,) of each contact."""
+        """For each contact force [N] and moment [N m] on the payload about the nominal contact
+        point, (6,)."""
         first, second = (ca.vertcat(*pair) for pair in zip(self.forces, self.moments, strict=True))
         return first, second
 
 
 @dataclass
 class ImplicitVariables:
-    """Symbols that stand for results of Newton's method. Outputs are built from the symbols;
-    `replaced` inserts the values.
+    """Symbols that stand for results of Newton's method while expressions are differentiated.
+    Outputs are built from the symbols; `replaced` then inserts the results.
 
     Attributes:
         steps: number of Newton steps between a symbol and the outputs. One step makes first
@@ -92,23 +97,23 @@ class ImplicitVariables:
     _found: list[tuple[ca.SX, ca.SX]] = field(default_factory=list)
 
     def detach(self, value: ca.SX) -> ca.SX:
-        """Return a new symbol that stands for a value."""
+        """Return a new scalar symbol that stands for the expression `value`."""
         symbol = ca.SX.sym("solved")
         self._found.append((symbol, value))
         return symbol
 
     @property
     def symbols(self) -> ca.SX:
-        """All symbols (k,)."""
+        """All k symbols, as a column (k,)."""
         return ca.vertcat(ca.SX(0, 1), *[symbol for symbol, _ in self._found])
 
     @property
     def values(self) -> ca.SX:
-        """Values (k,) of the symbols."""
+        """Expressions (k,) for which the k symbols stand."""
         return ca.vertcat(ca.SX(0, 1), *[value for _, value in self._found])
 
     def replaced(self, outputs: list[Expression]) -> list[Expression]:
-        """Return the outputs with the values inserted for the symbols."""
+        """Return expressions with every symbol replaced by the expression that it stands for."""
         if not self._found:
             return outputs
         found: list[Expression] = ca.substitute(outputs, [self.symbols], [self.values])
@@ -116,22 +121,23 @@ class ImplicitVariables:
 
 
 class ContactModel(ABC):
-    """A contact model of one workcell. Methods assume two pads with opposite normals, unless a
+    """Contact model of one workcell. Methods assume two pads with opposite normals, unless a
     subclass overrides them.
 
     Attributes:
-        workcell: the workcell; its numbers may be symbols.
+        workcell: the workcell; its parameters may be symbols.
         assumption: description of the pads that planned forces assume, for messages.
-        has_pressure_limit: True if the shift of the pressure within a patch is a limit of its own,
+        has_pressure_limit: True if the shift of the pressure within a patch has a limit of its own,
             because forces do not grow with the moments.
         has_elastic_layers: True if pads are elastic layers (`symbolic.contact.elastic`).
-        has_closed_form: True if `hold` gives the forces, False if a program computes them.
+        has_closed_form: True if `hold` computes the forces by formulas, False if they need a convex
+            program.
         is_squeeze: True if the arms press the payload between them. Forces are then commanded, and
-            reference forces also limit the whole force of a robot.
+            the reference force of a robot also limits the magnitude of its contact force.
         holders: description of the pads or hands that commanded forces assume, for messages.
         order: words of the command, as in 'press with 80 N'.
-        closing, opening: names of the phases of a job in which arms at rest take hold of the
-            payload, and let go of it.
+        closing: names of the phases of a job in which arms at rest take hold of the payload.
+        opening: names of the phases of a job in which arms at rest let go of the payload.
     """
 
     assumption: ClassVar[str]
@@ -149,29 +155,31 @@ class ContactModel(ABC):
 
     @property
     def has_scalar_squeeze(self) -> bool:
-        """True if the force of one pad determines that of the other. One number, the least squeeze,
-        then describes a case."""
+        """True if the normal force of one pad determines the normal force of the other. The least
+        squeeze, one number, then suffices for a worst case."""
         return self.has_closed_form
 
     @property
     def command_model(self) -> ContactModel:
-        """The contact model of commanded forces and worst cases."""
+        """Contact model with which commanded forces and worst cases are computed."""
         return self
 
     @property
     def pad_parameters(self) -> list[dict[str, Any]]:
-        """Derived quantities of each pad that formulas read, by field of `NumberedContact`."""
+        """One dictionary per pad: parameters of the model's formulas that NumPy derives, by name of
+        a field of `NumberedContact`."""
         return [{} for _ in self.workcell.pads]
 
     @property
     @abstractmethod
     def problem(self) -> Problem | None:
         """Key of the workcell file and message if the pads cannot hold the payload under every
-        motion, else None."""
+        motion; else None."""
 
     @property
     def level_force(self) -> float:
-        """Normal force that holds the payload level and at rest between upright contacts [N]."""
+        """Normal force of each of two pads with horizontal normals that holds the payload at rest
+        [N]."""
         weight = -self.workcell.payload.mass * GRAVITY[2]
         return float(weight / sum(contact.friction for contact in self.workcell.contacts))
 
@@ -182,40 +190,48 @@ class ContactModel(ABC):
         implicit: ImplicitVariables | None = None,
         displaced: bool = False,
     ) -> HeldLoad:
-        """Return the least contact forces that balance a load.
+        """Compute the least contact forces that balance a load.
 
         Args:
             load: load on both contacts.
-            implicit: collector of results of Newton's method, for exact derivatives; None for none.
-            displaced: True if the arms of the load may offset the pads laterally from each other.
+            implicit: collector of results of Newton's method, for exact derivatives; None if no
+                derivatives are needed.
+            displaced: True if `load.arms` may offset the pads laterally from each other.
         """
 
     # --- smooth quantities for the polish ---
 
     @property
     def force_branches(self) -> Array:
-        """Coefficients (2, branches, 2) of the linear functions of both `force_quantities` whose
-        maximum is the normal force of each contact."""
+        """Coefficients (2, b, 2) of b linear functions for each contact; the largest of them is the
+        contact's normal force. The functions depend on the two `force_quantities`."""
         return np.eye(2)[:, None]
 
     def force_quantities(self, load: ContactLoad, held: HeldLoad) -> Expression:
-        """Return two smooth quantities (2,) [N]. The branches of the normal forces are linear
-        functions of them."""
+        """Compute two quantities (2,) [N] that are smooth in the load. With the coefficients
+        `force_branches` they give the normal forces.
+
+        Args:
+            load: load on both contacts.
+            held: least contact forces for this load, from `hold`.
+        """
         return held.normal
 
     def planned_quantities(self, found: Mapping[str, Array]) -> Array:
-        """Return the `force_quantities` (n, 2) [N] of n samples from their `LOAD_OUTPUTS`."""
+        """Compute the two `force_quantities` (n, 2) [N] at n samples from arrays `found`, named as
+        in `LOAD_OUTPUTS`."""
         return found["normal_force"]
 
     # --- worst cases ---
 
     def least_friction(self, uncertainty: Uncertainty) -> Array:
         """Compute the friction coefficients (2,) that cover the worst case of an uncertainty; zero
-        or less if no friction is left.
+        or negative if no friction is left.
 
-        A pad tilted by t has the coefficient tan(atan mu - t). Pads displaced in opposite
-        directions by 2 e turn the squeeze into a moment. A coefficient lower by 2 e / L covers this
-        moment, L being the distance of the pads.
+        A pad with friction mu that is tilted by an angle t has the coefficient tan(atan mu - t).
+        Pads displaced in opposite directions, by 2 e relative to each other, turn the squeeze into
+        a moment. A coefficient lower by 2 e / L, with the distance L of the pads, covers this
+        moment.
         """
         friction = np.array([contact.friction for contact in self.workcell.contacts])
         left = np.tan(np.arctan(friction * (1.0 - uncertainty.friction)) - uncertainty.turned)
@@ -223,8 +239,8 @@ class ContactModel(ABC):
         return np.asarray(left - self.friction_lost(apart))
 
     def friction_lost(self, apart: Array) -> Array:
-        """Return the reductions (k,) of the friction coefficient that cover relative displacements
-        (k,) of the pads [m]."""
+        """Compute the reduction (k,) of the friction coefficient that covers each of k relative
+        displacements `apart` (k,) of the pads [m]."""
         return apart / self.workcell.pad_distance
 
     def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
@@ -233,8 +249,9 @@ class ContactModel(ABC):
         A common displacement of both pads shifts the centre of mass relative to them.
 
         Returns:
-            Half-widths (3,) of the range of the centre of mass [m], enlarged by common
-            displacements, and displacements (k, 4) of both pads along their tangents [m].
+            Half-widths (3,) of the range of the centre of mass along the box axes [m], enlarged by
+            common displacements; and k cases (k, 4) of the pads' displacements along their
+            tangents, two entries per robot [m].
         """
         normal = self.workcell.contacts[0].T_box_pad[:3, 2]
         across = np.sqrt(np.maximum(1.0 - normal**2, 0.0))
@@ -244,11 +261,12 @@ class ContactModel(ABC):
     def commanded_forces(
         self, normal: Expression, friction: Expression, tracking: Expression, opposed: Expression
     ) -> Expression:
-        """Return the commanded normal forces (2,) [N]. Both exceed the least forces by the same
-        amount, because the motion fixes their difference.
+        """Compute the normal forces (2,) to command [N]. The commanded force of each robot exceeds
+        its least force by the same amount, because the motion fixes the difference of the two
+        forces.
 
         Args:
-            normal: (2,) least normal forces [N].
+            normal: (2,) least normal forces of the robots [N].
             friction: (2,) Coulomb coefficients.
             tracking: (2,) share of each robot's force that may be missing.
             opposed: tangential force with which the arms may push against each other [N].
@@ -260,13 +278,13 @@ class ContactModel(ABC):
 
     @property
     def leading_share(self) -> Array:
-        """Rise of the leading robot's force per newton of the other robot's commanded force, for
-        either robot leading (2,)."""
+        """Rise of the leading robot's normal force per newton of the other robot's commanded force,
+        (2,): entry i for robot i as the leader."""
         return np.ones(2)
 
     def leading_excess(self, load: ContactLoad, opposed: Expression) -> Expression:
-        """Return the force of robot 1 minus `leading_share` times the commanded force of robot 2
-        [N].
+        """Compute the normal force of robot 1 minus `leading_share` times the commanded force of
+        robot 2 [N].
 
         Args:
             load: load on both contacts.
@@ -275,38 +293,50 @@ class ContactModel(ABC):
         return ca.dot(load.force, load.axes[:, 2])
 
     def internal_force_ratio(self, leader: int) -> Array:
-        """Return the rise (2,) of both robots' forces per newton that the force-controlled robot
-        presses beyond its planned force."""
+        """Return the rise (2,) of each robot's normal force per newton by which the
+        force-controlled robot presses more. `leader` is the index of the other robot."""
         return np.ones(2)
 
     def raised(self, planned: Array, extra: Array, leader: int) -> Array:
-        """Return the forces (n, 2) to command if that of the following robot rises by `extra` (n,)
-        beyond its planned one [N]."""
+        """Compute the normal forces (n, 2) to command [N] if the force of the force-controlled
+        robot rises.
+
+        Args:
+            planned: (n, 2) planned normal forces [N].
+            extra: (n,) rise of the force-controlled robot's force [N].
+            leader: index of the leading robot; the other one is force-controlled.
+        """
         return planned + np.multiply.outer(extra, self.internal_force_ratio(leader))
 
     def displacement_margin(self, uncertainty: Uncertainty) -> float:
-        """Return the distance by which displacements may still grow until forces can no longer be
-        computed [m]; zero or less if the uncertainty exceeds the range."""
+        """Return the distance by which the pads' displacements may still grow until forces can no
+        longer be computed [m]; zero or negative if the uncertainty already allows larger
+        displacements."""
         return np.inf
 
     # --- jobs ---
 
     def approach(self, arm: int) -> Array:
-        """Return the direction (3,) in which an arm's pad approaches the payload, box frame."""
+        """Return the unit direction (3,) in which the pad of arm `arm` approaches the payload, box
+        frame."""
         return self.workcell.contacts[arm].T_box_pad[:3, 2]
 
     def held_with(self, commanded: Array) -> Array:
-        """Return the normal forces (n, 2) [N] that hold the payload if these forces are
-        commanded."""
+        """Return the normal forces (n, 2) [N] with which the payload is held if `commanded` (n, 2)
+        is commanded."""
         return commanded
 
     def pulled_apart(self, along: Array, across: Array, stiffness: float) -> tuple[Array, Array]:
-        """Return the changes (n,) [N] of the normal forces and of the least normal forces if the
-        arms, as springs in series, are displaced against each other.
+        """Compute how the forces change if the arms, as springs in series, are displaced against
+        each other.
 
         Args:
-            along, across: displacements (n,) of one pad along its normal and across it [m].
+            along, across: (n,) displacements of one pad along its normal and across it [m].
             stiffness: stiffness of each arm at its pad [N/m].
+
+        Returns:
+            Changes (n,) of the normal forces, and changes (n,) of the least normal forces that hold
+            the payload [N].
         """
         friction = min(contact.friction for contact in self.workcell.contacts)
         return stiffness / 2.0 * along, stiffness / 2.0 * across / friction

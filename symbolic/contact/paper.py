@@ -34,17 +34,22 @@ def required_force(
     mass: float,
     acceleration: Expression,
 ) -> Expression:
-    """Compute the resultant force (3,) on the box [N] from the acceleration of its centre of mass
-    (Eq. 34)."""
+    """Compute the resultant force m (a - g) (3,) on the box, world frame [N] (Eq. 34).
+
+    Args:
+        mass: mass of the payload [kg].
+        acceleration: (3,) acceleration of the centre of mass, world frame [m/s^2].
+    """
     return mass * (acceleration - ca.DM(GRAVITY))
 
 
 def split_force(force: Expression, normal: Expression) -> tuple[Expression, Expression, Expression]:
-    """Split a force into normal component, tangential magnitude and unit tangential direction.
+    """Split a force into its normal component [N], the magnitude of its tangential part [N], and
+    the unit direction (3,) of the tangential part.
 
     Args:
-        force: (3,) [N].
-        normal: (3,) unit normal of contact 1.
+        force: (3,) force [N].
+        normal: (3,) unit normal of contact 1, along the same axes.
     """
     f_n = ca.dot(force, normal)
     tangent = force - f_n * normal
@@ -55,12 +60,18 @@ def split_force(force: Expression, normal: Expression) -> tuple[Expression, Expr
 def normal_force_branches(
     f_n: Expression, f_t: Expression, friction: tuple[float, float]
 ) -> Expression:
-    """Compute five smooth functions (5,) whose maximum is the normal force N_2 of contact 2 [N].
+    """Compute five smooth functions (5,) whose maximum is the least-effort normal force N_2 of
+    contact 2 [N]. The normal force of contact 1 is N_1 = N_2 + F_n.
 
-    N_1 = N_2 + F_n. In order: both friction cones tight; contact 2 unloaded; contact 1
-    unloaded; least effort with only the cone of contact 2 tight; with only that of contact 1.
-    A branch that is not the largest never cuts off the solution, because the effort is convex
-    in N_2 and rises wherever a cone is slack.
+    The functions belong to these cases, in order: both friction cones tight; contact 2 unloaded;
+    contact 1 unloaded; least effort with only the cone of contact 2 tight; least effort with only
+    the cone of contact 1 tight. The maximum is exact, because the effort is convex in N_2 and rises
+    wherever a cone is slack.
+
+    Args:
+        f_n: normal component of the resultant force along the normal of contact 1 [N].
+        f_t: magnitude of the tangential part of the resultant force [N].
+        friction: Coulomb coefficients of contacts 1 and 2.
     """
     mu_1, mu_2 = friction
     return ca.vertcat(
@@ -75,16 +86,17 @@ def normal_force_branches(
 def allocate(
     force: Expression, normal: Expression, friction: tuple[float, float]
 ) -> tuple[Expression, Expression, Both]:
-    """Compute the contact forces of least effort for a resultant force.
+    """Compute the contact forces of least effort, the minimum of |f_1|^2 + |f_2|^2, for a resultant
+    force.
 
     Args:
         force: (3,) resultant force on the box, world frame [N].
-        normal: (3,) unit normal of contact 1 in the world frame; contact 2 has its opposite.
+        normal: (3,) unit normal of contact 1, world frame; contact 2 has the opposite normal.
         friction: Coulomb coefficients of the two contacts.
 
     Returns:
-        Normal forces (2,), magnitudes of the tangential ones (2,), and both contact forces (3,),
-        world frame [N].
+        Normal forces (2,), magnitudes (2,) of the tangential forces, and the force (3,) of each
+        contact on the box, world frame [N].
     """
     f_n, f_t, direction = split_force(force, normal)
     n_2 = ca.mmax(normal_force_branches(f_n, f_t, friction))
@@ -114,14 +126,14 @@ error of the damping to its eighth power, below rounding wherever the moment can
 def required_moment(
     inertia: Expression, rotation: Expression, velocity: Expression, acceleration: Expression
 ) -> Expression:
-    """Compute the moment (3,) about the centre of mass that the rotation requires (Eqs. 52-53) [N
-    m].
+    """Compute the moment (3,) about the centre of mass that the rotation requires, world frame [N
+    m] (Eqs. 52-53).
 
     Args:
         inertia: (3, 3) inertia about the centre of mass, box axes [kg m^2].
-        rotation: R_world_box (3, 3).
-        velocity, acceleration: (3,) angular velocity and acceleration, world frame [rad/s,
-            rad/s^2].
+        rotation: (3, 3) R_world_box.
+        velocity, acceleration: (3,) angular velocity [rad/s] and angular acceleration [rad/s^2],
+            world frame.
     """
     inertia_world = ca.mtimes([rotation, inertia, rotation.T])
     return ca.mtimes(inertia_world, acceleration) + ca.cross(
@@ -135,18 +147,20 @@ def pressure_shift(
     forces: tuple[Expression, Expression],
     tangents: tuple[Expression, Expression],
 ) -> tuple[Both, Expression, Expression]:
-    """Compute the least-norm shifts of both centres of pressure that minimise the unbalanced moment
-    (Eqs. 54-59).
+    """Compute the shifts of both centres of pressure that minimise the unbalanced moment; of these,
+    the shifts of least norm (Eqs. 54-59). All vectors are in the world frame.
 
     Args:
         moment: (3,) required moment about the centre of mass [N m].
-        arms: (3,) each, from the centre of mass to the nominal contact points [m].
-        forces: (3,) each, contact forces on the box [N].
+        arms: for each contact the vector (3,) from the centre of mass to the nominal contact point
+            [m].
+        forces: for each contact the force (3,) on the box [N].
         tangents: two orthonormal vectors (3,) that span both contact planes, which are parallel.
 
     Returns:
-        Shifts (3,) in the tangent planes [m]; unbalanced moment (3,) with the forces at the nominal
-        points, and with the shifts applied, world frame [N m].
+        The shift (3,) of each contact in its tangent plane [m]; the unbalanced moment (3,) with the
+        forces at the nominal points [N m]; and the unbalanced moment (3,) with the forces at the
+        shifted points [N m].
     """
     point_residual = moment - ca.cross(arms[0], forces[0]) - ca.cross(arms[1], forces[1])
     plane = ca.horzcat(*tangents)

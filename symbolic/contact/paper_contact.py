@@ -15,7 +15,8 @@ from symbolic.expression import Expression
 
 
 class PaperContact(ContactModel):
-    """Two round pads with opposite normals that choose their pressure.
+    """Contact model of two round pads with opposite normals whose centres of pressure can be
+    commanded.
 
     Such pads need commanded moments at both wrists, which few cells offer. So commanded forces are
     computed for evenly pressing pads.
@@ -26,12 +27,14 @@ class PaperContact(ContactModel):
 
     @property
     def command_model(self) -> ContactModel:
-        """The model of evenly pressing pads, for commanded forces and worst cases."""
+        """Contact model of evenly pressing pads (`symbolic.contact.soft_contact`), used for
+        commanded forces and worst cases."""
         return soft_finger(self.workcell)
 
     @property
     def problem(self) -> Problem | None:
-        """Key and message unless there are two round pads with opposite normals."""
+        """None if two round pads with opposite normals hold the payload; else key of the workcell
+        file and message."""
         workcell = self.workcell
         if workcell.has_facing_pads:
             return None
@@ -50,8 +53,14 @@ class PaperContact(ContactModel):
         implicit: ImplicitVariables | None = None,
         displaced: bool = False,
     ) -> HeldLoad:
-        """Return the least forces (paper Eqs. 38-42) and the pressure shifts (Eqs. 51-59) that
-        balance a load."""
+        """Compute the least contact forces (paper Eqs. 38-42) and the pressure shifts (Eqs. 51-59)
+        that balance a load.
+
+        Args:
+            load: load on both contacts.
+            implicit: not used.
+            displaced: not used.
+        """
         axes, mu = load.axes, load.friction
         normal, tangential, forces = allocate(load.force, axes[:, 2], (mu[0], mu[1]))
         tangents = axes[:, 0], axes[:, 1]
@@ -61,8 +70,9 @@ class PaperContact(ContactModel):
 
     @property
     def force_branches(self) -> Array:
-        """(2, 5, 2) coefficients of the five branches of each contact's normal force: of the normal
-        component F_n and of the tangential magnitude F_t of the required force."""
+        """Coefficients (2, 5, 2) of each contact's five `normal_force_branches`. A branch is a
+        linear function of the normal component F_n and the tangential magnitude F_t of the required
+        force."""
         f_n, f_t = ca.SX.sym("f_n"), ca.SX.sym("f_t")
         contacts = self.workcell.contacts
         second = normal_force_branches(f_n, f_t, (contacts[0].friction, contacts[1].friction))
@@ -72,12 +82,19 @@ class PaperContact(ContactModel):
         )
 
     def force_quantities(self, load: ContactLoad, held: HeldLoad) -> Expression:
-        """Return the normal component and the tangential magnitude (2,) of the required force
-        [N]."""
+        """Compute the normal component F_n and the tangential magnitude F_t of the required force,
+        (2,) [N]."""
         return ca.vertcat(*split_force(load.force, load.axes[:, 2])[:2])
 
     def planned_quantities(self, found: Mapping[str, Array]) -> Array:
-        """Return normal component and tangential magnitude (n, 2) of the required force [N] of n
-        samples. Both contacts' tangential forces have the same direction, so they add up."""
+        """Compute the normal component F_n and the tangential magnitude F_t of the required force
+        at n samples, (n, 2) [N].
+
+        The tangential forces of both contacts have the same direction, so F_t is the sum of their
+        magnitudes.
+
+        Args:
+            found: arrays of n samples by name, as in `LOAD_OUTPUTS`.
+        """
         normal, tangential = found["normal_force"], found["tangential_force"]
         return np.column_stack([normal[:, 0] - normal[:, 1], tangential.sum(axis=1)])

@@ -20,13 +20,18 @@ CONTACT_MODELS: dict[str, Callable[[Workcell], ContactModel]] = {
 
 
 def contact_model(workcell: Workcell) -> ContactModel:
-    """Return the contact model of a workcell."""
+    """Return the contact model that `task.allocation` of a workcell names."""
     return CONTACT_MODELS[workcell.task.allocation](workcell)
 
 
 def squeeze_problem(workcell: Workcell, purpose: str) -> str:
-    """Return a message why a purpose does not apply to hands that hold without a squeeze; '' for
-    pads that press."""
+    """Return the message that something is only for pads that press, if a workcell has hands that
+    hold without a squeeze; '' for pads that press.
+
+    Args:
+        workcell: the cell.
+        purpose: what needs pads that press; the subject of the message.
+    """
     if contact_model(workcell).is_squeeze:
         return ""
     return (
@@ -36,16 +41,20 @@ def squeeze_problem(workcell: Workcell, purpose: str) -> str:
 
 
 def require_squeeze(workcell: Workcell, purpose: str) -> None:
-    """Check that the arms of a workcell press the payload between them.
+    """Raise an error unless the arms of a workcell press the payload between them.
+
+    Args:
+        workcell: the cell.
+        purpose: what needs pads that press; the subject of the message.
 
     Raises:
-        SettingsError: the workcell has hands that hold without a squeeze; the message names the
-            purpose.
+        SettingsError: the workcell has hands that hold without a squeeze.
     """
     if problem := squeeze_problem(workcell, purpose):
         raise SettingsError(problem, code="needs-pads")
 
 
 def command_model(workcell: Workcell) -> ContactModel:
-    """Return the contact model of a workcell's commanded forces and worst cases."""
+    """Return the contact model with which a workcell's commanded forces and worst cases are
+    computed."""
     return contact_model(workcell).command_model

@@ -27,21 +27,22 @@ distance between two pads of different robots."""
 
 
 def soft_finger(workcell: Workcell) -> ContactModel:
-    """Return the model of a workcell's soft fingers: in closed form for two pads with opposite
-    normals, else by a program."""
+    """Return the contact model of a workcell's soft fingers: by formulas for two pads with opposite
+    normals, else by a convex program."""
     return (SoftFinger if workcell.has_opposite_pads else SoftFingerGrasp)(workcell)
 
 
 class SoftFinger(ContactModel):
-    """Soft fingers: two pads with opposite normals and any patches. Forces have a closed form."""
+    """Contact model of two soft fingers with opposite normals and patches of any shape. Their
+    forces have a closed form."""
 
     assumption = "pads that press evenly, on arms that keep their orientation"
     has_elastic_layers = True
 
     @property
     def problem(self) -> Problem | None:
-        """Key and message if the pads are offset too far laterally to hold the payload, else
-        None."""
+        """Key of the workcell file and message if the pads are offset too far laterally to hold the
+        payload; else None."""
         friction = min(contact.friction for contact in self.workcell.contacts)
         beside, room = self.workcell.pad_offset, friction * self.workcell.pad_distance
         if beside < PAD_OFFSET_SHARE * room:
@@ -59,8 +60,15 @@ class SoftFinger(ContactModel):
         implicit: ImplicitVariables | None = None,
         displaced: bool = False,
     ) -> HeldLoad:
-        """Return the least forces that balance a load. The pressure does not shift. Both pads share
-        the torsion in proportion to what each can bear."""
+        """Compute the least contact forces that balance a load. Centres of pressure do not shift.
+        The pads share the torsion in proportion to their torsion capacities.
+
+        Args:
+            load: load on both contacts.
+            implicit: collector of results of Newton's method, for exact derivatives; None if no
+                derivatives are needed.
+            displaced: True if `load.arms` may offset the pads laterally from each other.
+        """
         workcell, axes = self.workcell, load.axes
         in_box = workcell.contacts[0].T_box_pad[:3, :3]
         patches = [SoftPatch.of(contact, in_box) for contact in workcell.contacts]
@@ -93,14 +101,14 @@ class SoftFinger(ContactModel):
 
 
 class SoftFingerGrasp(SoftFinger):
-    """Soft fingers with any normals, also several per arm. The program of `symbolic.contact.grasp`
-    computes their forces."""
+    """Contact model of soft fingers with any normals, one or several per arm. The convex program of
+    `symbolic.contact.grasp` computes their forces."""
 
     has_closed_form = False
 
     @property
     def problem(self) -> Problem | None:
-        """Key and message if friction does not close the grasp, else None."""
+        """Key of the workcell file and message if friction does not close the grasp; else None."""
         if has_force_closure(self.workcell):
             return None
         return (
@@ -112,32 +120,41 @@ class SoftFingerGrasp(SoftFinger):
         )
 
     def friction_lost(self, apart: Array) -> Array:
-        """Return zero: displacements have cases of their own."""
+        """Return zeros (k,) for k displacements `apart` [m]: worst cases displace these pads
+        explicitly, not by a lower friction."""
         return 0.0 * apart
 
     def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
-        """Return half-widths (3,) of the range of the centre of mass [m], and the corners (k, 4)
-        [m] of squares around the discs of the pads' displacements. To first order no displacements
-        are worse."""
+        """Return the worst displacements of the pads under an uncertainty.
+
+        Returns:
+            Half-widths (3,) of the range of the centre of mass along the box axes [m]; and k cases
+            (k, 4) of displacements along the pads' tangents, two entries per robot [m]. The cases
+            are the corners of squares around the discs within which pads may be displaced; to first
+            order no displacements are worse.
+        """
         off = uncertainty.pad_position + uncertainty.apart / 2.0
         signs = product((-1.0, 1.0) if off > 0.0 else (0.0,), repeat=4)
         return uncertainty.centre_of_mass, np.array([off * np.array(at) for at in signs])
 
     def displacement_margin(self, uncertainty: Uncertainty) -> float:
-        """Return the distance by which displacements may still grow until forces can no longer be
-        computed [m]; zero or less if the uncertainty exceeds the range."""
+        """Return the distance by which the pads' displacements may still grow until forces can no
+        longer be computed [m]; zero or negative if the uncertainty already allows larger
+        displacements."""
         off = uncertainty.pad_position + uncertainty.apart / 2.0
         return LARGEST_DISPLACEMENT * least_distance(self.workcell) - off
 
     @property
     def leading_share(self) -> Array:
-        """Rise of the leading robot's force per newton of the other robot's commanded force (2,),
-        in the initial squeeze of `GraspSqueeze`."""
+        """Rise of the leading robot's normal force per newton of the other robot's commanded force,
+        (2,): entry i for robot i as the leader. It is taken from the internal squeeze of
+        `GraspSqueeze`."""
         normals = GraspSqueeze(self.workcell, 1).squeeze_normals()
         return np.asarray(normals / normals[::-1])
 
     def internal_force_ratio(self, leader: int) -> Array:
-        """Return the rise (2,) of both robots' forces in an internal squeeze of the pads, per
-        newton that the force-controlled robot presses more."""
+        """Return the rise (2,) of each robot's normal force in the pads' internal squeeze, per
+        newton by which the force-controlled robot presses more. `leader` is the index of the other
+        robot."""
         normals = Grasp(self.workcell).squeeze_normals()
         return np.asarray(normals / normals[1 - leader])

@@ -67,13 +67,13 @@ Load: TypeAlias = tuple[Expression, Expression, Expression]
 
 @dataclass(frozen=True)
 class SoftPatch:
-    """Lengths of a patch that determine its torsion capacity under even pressure.
+    """Lengths of a patch that determine the torsion that it bears under even pressure.
 
     Attributes:
-        twist: mean distance of the points from the centre [m].
-        spread: (2, 2) matrix; the length of its product with a unit vector along the tangents of
-            contact 1 is twice the root mean square of the points' coordinates along that vector
-            [m]. For a disc it is the radius times a rotation.
+        twist: mean distance of the patch's points from its centre [m].
+        spread: (2, 2) matrix S [m]. For a unit vector t along the tangents of contact 1, |S t| is
+            twice the root mean square of the points' coordinates along t. For a disc S is the
+            radius times a rotation.
     """
 
     twist: float | ca.SX
@@ -81,7 +81,7 @@ class SoftPatch:
 
     @classmethod
     def of(cls, contact: Contact, axes: Array) -> SoftPatch:
-        """Return the patch of a contact in the tangential axes of contact 1.
+        """Return the patch of a contact, along the tangents of contact 1.
 
         Args:
             contact: contact with a round or rectangular patch.
@@ -101,13 +101,14 @@ class SoftPatch:
 
 @dataclass(frozen=True)
 class SoftFingers:
-    """Forces of both contacts, along the tangents a, b and the normal n of contact 1.
+    """Forces of two soft fingers, along the tangents a, b and the normal n of contact 1.
 
     Attributes:
-        normal: (2,) N_1, N_2 [N].
-        tangent_1, tangent_2: (2,) tangential forces on the box [N].
+        normal: (2,) normal forces N_1, N_2 [N].
+        tangent_1, tangent_2: (2,) tangential force of each contact on the box, along a and b [N].
         torsion: moment about n that both contacts bear together [N m].
-        capacity: (2,) torsion that each contact could bear beside its tangential force [N m].
+        capacity: (2,) largest torsion that each contact can bear in addition to its tangential
+            force [N m].
     """
 
     normal: Expression
@@ -120,12 +121,12 @@ class SoftFingers:
 def torsion_capacity(
     grip: Expression, tangent: Expression, patch: SoftPatch
 ) -> tuple[Expression, Expression]:
-    """Compute the torsion that a pad can bear, the right side of (1) [N m], and its derivative by
-    sqrt(grip^2 - |tangent|^2) [m].
+    """Compute the largest torsion that a pad can bear, the right side of (1) [N m], and its
+    derivative by the grip [m].
 
     Args:
-        grip: sqrt(mu^2 N^2 - |T|^2), the friction left beside the tangential force [N].
-        tangent: (2,) tangential force [N].
+        grip: sqrt(mu^2 N^2 - |T|^2), the friction that the tangential force leaves [N].
+        tangent: (2,) tangential force T [N].
         patch: patch of the pad.
     """
     return _capacity(grip, _squared(tangent), patch.twist, _half_spread(patch, tangent))
@@ -164,17 +165,18 @@ def least_soft_squeeze(
     offset: bool = False,
     implicit: ImplicitVariables | None = None,
 ) -> SoftFingers:
-    """Compute the forces with the least squeeze that balances a load.
+    """Compute the forces of two soft fingers that balance a load with the least squeeze. All
+    vectors are along the tangents and the normal of contact 1.
 
     Args:
-        force, moment: (3,) force and moment of both contacts on the payload, about its centre of
-            mass [N, N m].
-        arms: (3,) each, from the centre of mass to the contacts [m].
+        force, moment: (3,) force [N] and moment about the centre of mass [N m] that both contacts
+            exert together on the payload.
+        arms: for each contact the vector (3,) from the centre of mass to the contact point [m].
         friction: (2,) Coulomb coefficients.
         patches: patches of both pads.
         offset: True if the contacts may be laterally offset. Tangential forces and torsion then
             depend on the squeeze.
-        implicit: collector of results of Newton's method, for exact derivatives; unused with
+        implicit: collector of results of Newton's method, for exact derivatives; not used with
             `offset`.
     """
     apart = arms[0] - arms[1]

@@ -35,15 +35,15 @@ ROBOTS = 2
 
 
 class SoftGrasp:
-    """The program of a grasp's pads at nominal friction with one weight of the barriers. The last
-    inputs of all its functions are the grasp's symbolic parameters.
+    """Convex program of a grasp's pads on its central path: nominal friction and a constant weight
+    of the barriers. The last inputs of all its functions are the grasp's symbolic parameters.
 
     Attributes:
-        grasp: the pads.
-        weight: weight mu of the barriers.
-        size, ends: size of the states of all patches together, and index of the first entry of
-            each.
-        normals: matrix C (2, size) from states to both robots' normal forces.
+        grasp: program of the pads.
+        weight: weight mu of the barriers over the effort.
+        size: number of entries of the states of all patches together.
+        ends: index at which each patch begins in these entries, then `size`.
+        normals: matrix C (2, size) from the states to the normal forces of the robots.
     """
 
     def __init__(self, grasp: Grasp, weight: float) -> None:
@@ -55,8 +55,12 @@ class SoftGrasp:
         self.normals = ca.sparsify(ca.DM(normals))
 
     def first(self) -> ca.Function:
-        """Build the function from a load (6,) about the box frame's origin, box axes, to the normal
-        forces (2,) of the robots [N], their gradients slope (6, 2), and state (size,)."""
+        """Build the function that solves the program for one load.
+
+        Input: load (6,), force and moment about the box frame's origin, along the box's axes [N, N
+        m]. Outputs: normal (2,), normal forces of the robots [N]; slope (6, 2), their derivatives
+        by the load; state (size,) of all patches.
+        """
         load, handed = ca.MX.sym("load", LOAD_SIZE), mx_symbols(self.grasp.given)
         state = self.solve(load, handed)
         outputs = [*self.slopes()(state, *handed.values()), state]
@@ -64,11 +68,11 @@ class SoftGrasp:
         return ca.Function("held_first", inputs, outputs, names, ["normal", "slope", "state"])
 
     def solve(self, load: ca.MX, handed: dict[str, ca.MX]) -> ca.MX:
-        """Build the expression of the state (size,) that balances a load (6,).
+        """Build the expression of the states (size,) of all patches that balance a load.
 
         Args:
             load: (6,) force and moment about the box frame's origin, along the box's axes [N, N m].
-            handed: symbolic parameters of the grasp.
+            handed: symbolic parameters of the grasp by group.
         """
         given = list(handed.values())
         friction = as_mx(self.grasp.friction, self.grasp.given, handed)
@@ -80,8 +84,12 @@ class SoftGrasp:
         return state
 
     def wrenches(self, slopes: bool) -> ca.Function:
-        """Build the function from a state (size,) to the wrenches (6 k,) of all k pads along the
-        pads' axes. With `slopes` it also returns their derivatives (6 k, 6) by the load."""
+        """Build the function from the states (size,) of all patches to the wrenches (6 k,) of the k
+        pads: N, T (2,) [N], N d (2,), M [N m] of each pad along its axes.
+
+        Args:
+            slopes: True for a second output, the derivatives (6 k, 6) of the wrenches by the load.
+        """
         state = ca.SX.sym("state", self.size)
         own = wrenches_of(self.grasp, ca.vertsplit(state, self.ends))
         units = [self.grasp.units(i, self.grasp.friction) * wrench for i, wrench in enumerate(own)]
@@ -93,8 +101,11 @@ class SoftGrasp:
         return ca.Function("held_wrenches", [state, *self.grasp.given.values()], results)
 
     def second(self) -> ca.Function:
-        """Build the function from a state (size,) and weights (2,) to the weighted sum (6, 6) of
-        the normal forces' second derivatives by the load."""
+        """Build the function of the normal forces' second derivatives by the load.
+
+        Inputs: state (size,) of all patches; weight (2,) of each robot's normal force. Output:
+        curvature (6, 6), the Hessian of the weighted sum of the normal forces.
+        """
         state, weight = ca.SX.sym("state", self.size), ca.SX.sym("weight", ROBOTS)
         local = _Local(self, state)
         along = local.solve(-ca.mtimes(self.normals.T, weight))
@@ -108,8 +119,8 @@ class SoftGrasp:
         )
 
     def slopes(self) -> ca.Function:
-        """Build the function from a state to both robots' normal forces (2,) [N] and their
-        gradients (6, 2) by the load."""
+        """Build the function from the states (size,) of all patches to the normal forces (2,) of
+        the robots [N] and the derivatives (6, 2) of these forces by the load."""
         state = ca.SX.sym("state", self.size)
         by_load = _Local(self, state).by_load()
         outputs = [ca.mtimes(self.normals, state), ca.mtimes(self.normals, by_load).T]

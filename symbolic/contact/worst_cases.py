@@ -76,12 +76,12 @@ MOTION = ("pose", "rate", "second_rate")
 def case_squeeze_function(
     workcell: Workcell, commanded: int = 1, displaced: bool = True
 ) -> ca.Function:
-    """Build the function of the least forces in a case.
+    """Build the function of the least commanded normal forces in one case of an uncertainty.
 
-    Inputs: pose, rate, second_rate (6,) and a case (18,) laid out by `CASE_SIZES`. Output:
-    normal_force (2,) [N]. With a scalar squeeze both forces are least: more holds the case, less
-    does not. Otherwise the force of the commanded robot is least, and the other force results from
-    it.
+    Inputs: pose, rate, second_rate (6,), the box pose and its time derivatives; case (18,), laid
+    out by `CASE_SIZES`; then symbolic parameters. Output: normal_force (2,) [N]. With two opposite
+    pads or holding hands, both forces are least. With other pads, the force of the robot
+    `commanded` is least, and the other robot's force results from it.
 
     Args:
         workcell: the workcell.
@@ -99,18 +99,21 @@ def case_squeeze_function(
 def case_gradient_function(
     workcell: Workcell, commanded: int = 1, numbers: bool = False
 ) -> ca.Function:
-    """Build the function of `case_squeeze_function` with derivatives, for cases without displaced
-    pads if there is a scalar squeeze.
+    """Build the function of the least commanded normal forces in one case, with derivatives by the
+    motion.
 
-    The additional output slope (NumPy shape (2, 18)) has the derivatives of each force by pose,
-    rate and second_rate.
+    Inputs and the output normal_force (2,) are those of `case_squeeze_function`. The output slope
+    (NumPy shape (2, 18)) has the derivatives of each force by pose, rate and second_rate.
+
+    If two opposite pads or holding hands have a closed form, the case must not displace the pads
+    unless `numbers` is True.
 
     Args:
         workcell: the workcell.
         commanded: index of the robot whose force is commanded.
-        numbers: True to append derivatives by the case (18,) and by the cell's parameters. For pads
-            with any normals, derivatives by the load (6,) of `case_origin_load_function` take the
-            place of the latter.
+        numbers: True to append to slope the derivatives by the case (18,), then by the cell's
+            symbolic parameters. For pads with any normals, derivatives by the load (6,) of
+            `case_origin_load_function` take the place of the derivatives by the parameters.
     """
     squeeze, inputs = _program_and_inputs(workcell, commanded)
     by = [*inputs.values()] if numbers else [inputs[name] for name in MOTION]
@@ -132,12 +135,13 @@ def case_gradient_function(
 
 
 def case_slopes_function(workcell: Workcell) -> ca.Function:
-    """Build the function of the least forces in a case along a path, for cases without displaced
-    pads.
+    """Build the function of the least commanded normal forces in one case along a path, with
+    derivatives by path and timing. The case must not displace the pads.
 
-    Inputs: box pose and its first and second derivative by u (6,), u'', u'^2, and a case (18,) laid
-    out by `CASE_SIZES`. Outputs: normal_force (2,) [N] as in `case_squeeze_function`, and slope
-    (NumPy shape (2, 20)), the derivatives by pose, both derivatives of the pose, u'' and u'^2.
+    Inputs: pose, first, second (6,), the box pose and its first and second derivative by u; a =
+    u''; w = u'^2; case (18,), laid out by `CASE_SIZES`; then symbolic parameters. Outputs:
+    normal_force (2,) [N], as in `case_squeeze_function`; slope (NumPy shape (2, 20)), the
+    derivatives of each force by pose, first, second, a and w.
     """
     inputs = _inputs(ca.SX, sx_parameters(workcell.payload))
     path = {name: ca.SX.sym(name, 6) for name in ("pose", "first", "second")}
@@ -155,8 +159,11 @@ def case_slopes_function(workcell: Workcell) -> ca.Function:
 
 
 def case_excess_function(workcell: Workcell) -> ca.Function:
-    """Build the function from pose, rate, second_rate (6,) and a case (18,) laid out by
-    `CASE_SIZES` to the output excess [N] of `ContactModel.leading_excess`."""
+    """Build the function of `ContactModel.leading_excess` in one case of an uncertainty.
+
+    Inputs: pose, rate, second_rate (6,), the box pose and its time derivatives; case (18,), laid
+    out by `CASE_SIZES`; then the payload's symbolic parameters. Output: excess, a scalar [N].
+    """
     inputs = _inputs(ca.SX, sx_parameters(workcell.payload))
     load, opposed = case_contact_load(workcell, inputs), case_parts(inputs["case"])[-1]
     excess = command_model(workcell).leading_excess(load, opposed)
@@ -164,11 +171,16 @@ def case_excess_function(workcell: Workcell) -> ca.Function:
 
 
 def case_slack_function(workcell: Workcell, commanded: int = 1) -> ca.Function:
-    """Build a sufficient test that a commanded force holds a case.
+    """Build a fast, sufficient test that a commanded force holds the payload in one case.
 
-    Inputs: pose, rate, second_rate (6,), a case (18,) and the force [N]. Output: slack. A positive
-    slack proves that the force holds the case; otherwise only `case_squeeze_function` decides. The
-    test takes a thirtieth of that function's time.
+    Inputs: pose, rate, second_rate (6,), the box pose and its time derivatives; case (18,), laid
+    out by `CASE_SIZES`; force, the commanded normal force [N]; then symbolic parameters. Output:
+    slack. If slack is positive, the force holds the payload; if not, only `case_squeeze_function`
+    decides. The test takes a thirtieth of the time of `case_squeeze_function`.
+
+    Args:
+        workcell: the workcell.
+        commanded: index of the robot whose force is commanded.
     """
     squeeze = (
         None if command_model(workcell).has_scalar_squeeze else GraspSqueeze(workcell, commanded)
@@ -242,17 +254,18 @@ def _origin_load(workcell: Workcell, inputs: dict[str, Expression]) -> Expressio
 
 
 def case_parts(case: ca.SX | ca.MX) -> list[ca.SX | ca.MX]:
-    """Split a case (18,) into the parts of `CASE_SIZES`."""
+    """Split a case (18,) into its parts, in the order and with the sizes of `CASE_SIZES`."""
     return list(ca.vertsplit(case, [0, *accumulate(CASE_SIZES.values())]))
 
 
 def case_contact_load(workcell: Workcell, inputs: Mapping[str, Expression]) -> ContactLoad:
-    """Return the load on the contacts in a case, along the axes of contact 1 and about the nominal
-    centre of mass.
+    """Compute the load on the contacts in one case: force and moment about the nominal centre of
+    mass, along the axes of contact 1.
 
     Args:
         workcell: the workcell.
-        inputs: pose, rate, second_rate (6,) and case (18,) laid out by `CASE_SIZES`.
+        inputs: symbols by name: pose, rate, second_rate (6,), and case (18,) laid out by
+            `CASE_SIZES`.
     """
     case = inputs["case"]
     friction, *_, displacement, _, _ = case_parts(case)
@@ -271,8 +284,12 @@ def case_contact_load(workcell: Workcell, inputs: Mapping[str, Expression]) -> C
 
 
 def case_load_function(workcell: Workcell) -> ca.Function:
-    """Build the function from pose, rate, second_rate (6,) and a case (18,) to the required force
-    and the required moment about the nominal centre of mass, (3,) each, box axes."""
+    """Build the function of the force and moment that the motion requires in one case.
+
+    Inputs: pose, rate, second_rate (6,), the box pose and its time derivatives; case (18,), laid
+    out by `CASE_SIZES`; then the payload's symbolic parameters. Outputs: force (3,) [N] and moment
+    (3,) about the nominal centre of mass [N m], box axes.
+    """
     payload = workcell.payload
     inputs = [*_inputs(ca.SX, sx_parameters(payload)).values()]
     pose, rate, second, case, *_ = inputs
@@ -324,8 +341,12 @@ def _sizes_function(squeeze: GraspSqueeze) -> ca.Function:
 
 
 def case_origin_load_function(workcell: Workcell) -> ca.Function:
-    """Build the function from pose, rate, second_rate (6,) and a case (18,) to the load (6,) about
-    the box frame's origin, along the box's axes [N, N m]."""
+    """Build the function of the load that the pads have to balance in one case.
+
+    Inputs: pose, rate, second_rate (6,), the box pose and its time derivatives; case (18,), laid
+    out by `CASE_SIZES`; then the payload's symbolic parameters. Output: force and moment (6,) about
+    the box frame's origin, along the box's axes [N, N m].
+    """
     inputs = [*_inputs(ca.SX, sx_parameters(workcell.payload)).values()]
     force, moment = case_load_function(workcell)(*inputs)
     about = moment + ca.cross(ca.SX(number(workcell.payload.centre_of_mass)), force)
