@@ -1,13 +1,12 @@
-"""From functions and C text to loaded libraries, found in the cache or compiled in parallel.
+"""Compile functions to shared libraries, or load them from the cache.
 
-There is one way for all of them. A `CSource` is C to compile: of one CasADi function with its
-driver, of one that is written by hand, or of a program (`load_or_build_program`). Its library is
-kept under a key of the text and of what compiles it; long functions in it are parts, object files
-under keys of their own. What sources are made from has a key as well, a recipe's: under it the
-cache holds the keys of the libraries, so that a warm start makes neither expressions nor C.
+A `CSource` is the C text of one library: a CasADi function with its batch driver, a function
+written by hand, or a program (`load_or_build_program`). The key of a library follows from its text
+and the compiler. Long functions of a text are compiled to object files with keys of their own. The
+cache also stores the keys of all libraries of a set, under a key of the inputs from which the set
+is generated. So a second start of a program generates neither expressions nor C.
 
-Functions of scalars in a set that is evaluated in batches may be stored as tapes instead
-(`codegen.tape`): they need no compiler.
+Functions over CasADi's SX may be stored as tapes instead (`codegen.tape`), without a compiler.
 """
 
 from __future__ import annotations
@@ -63,16 +62,16 @@ the first while the second is made."""
 
 @dataclass(frozen=True)
 class CSource:
-    """C to compile.
+    """C text of one library.
 
     Attributes:
         name: name of the compiled function in its set.
-        text: the C.
-        level: optimisation level.
-        lanes: evaluations side by side, 0 for what suits the machine; 1 for none.
-        signature: of the function in it; None where it is none with the driver.
+        text: the C text.
+        level: optimisation level of the compiler, 0 to 3.
+        lanes: number of evaluations side by side; 1 for no lanes, 0 for the machine's width.
+        signature: signature of the function; None if the library has no batch driver.
         operations: instructions per evaluation, see `codegen.source.operations`.
-        most: highest level of its parts.
+        most: highest optimisation level of functions that are compiled separately.
     """
 
     name: str
@@ -85,8 +84,11 @@ class CSource:
 
     @classmethod
     def of(cls, name: str, function: ca.Function, lanes: int, level: int | None) -> CSource:
-        """Generate the C of a function; level None chooses one by the size of the generated text.
-        Without lanes, with one warning, if its C has no form in lanes."""
+        """Generate the C text of a CasADi function.
+
+        If the function has no form in lanes, a warning is given and the text has one lane. For
+        `level` None the size of the generated text decides the optimisation level.
+        """
         from codegen.source import c_source, dense, generated_c, operations
 
         whole = dense(function)
@@ -102,11 +104,11 @@ class CSource:
 
 @dataclass(frozen=True)
 class Library:
-    """A library of the cache, loaded.
+    """A loaded library of the cache.
 
     Attributes:
-        entry: its entry in the cache.
-        handle: its functions, by attribute.
+        entry: the library's entry in the cache.
+        handle: ctypes handle, with the C functions as attributes.
     """
 
     entry: CacheEntry
@@ -116,7 +118,7 @@ class Library:
         """Return the library's content as a numeric function.
 
         Raises:
-            CodegenError: it has no driver.
+            CodegenError: the library has no batch driver.
         """
         signature = Signature.from_json(self.entry.facts["signature"])
         return CompiledFunction(signature, self.entry.library, self.handle)
@@ -124,11 +126,11 @@ class Library:
 
 @dataclass(frozen=True)
 class StoredTape:
-    """A tape of the cache.
+    """A tape in the cache.
 
     Attributes:
-        entry: its entry in the cache.
-        tape: its instructions.
+        entry: the tape's entry in the cache.
+        tape: the instructions of the function.
     """
 
     entry: CacheEntry
@@ -144,12 +146,12 @@ class FunctionReport:
     """Record of one function's build.
 
     Attributes:
-        name: in the set that was built.
+        name: name of the function in its set.
         operations: instructions per evaluation, see `codegen.source.operations`.
         c_bytes: size of the C text.
-        compile_seconds: time of the compiler, now or when the cached library was made.
-        level: the compiler's optimisation level.
-        from_cache: whether the library was there already.
+        compile_seconds: time of the compiler when the library was made [s].
+        level: optimisation level of the compiler.
+        from_cache: True if the cache already had the library.
     """
 
     name: str
@@ -162,12 +164,12 @@ class FunctionReport:
 
 @dataclass(frozen=True)
 class Build:
-    """A set of functions and how each was built, in the order they were given.
+    """Compiled functions and reports on their builds, in the order in which they were requested.
 
     Attributes:
-        functions: by name.
-        reports: how each was built.
-        keys: by name, where the cache holds it.
+        functions: the compiled functions by name.
+        reports: one report per function.
+        keys: cache key of each function's library, by the function's name.
     """
 
     functions: dict[str, NumericFunction]
@@ -176,11 +178,13 @@ class Build:
 
 
 def compiler_of(cache: Cache) -> Compiler:
-    """Return the C compiler; without one, the compiler that made the cached libraries for this
-    processor, so that they are found.
+    """Return the C compiler of this machine.
+
+    On a machine without compiler, return the record of the one that made the cached libraries for
+    this type of processor: their keys depend on it.
 
     Raises:
-        CodegenError: there is none, and CC names one or the cache knows of none.
+        CodegenError: no compiler works, and the cache has no record of one or CC names one.
     """
     try:
         return find_compiler()
@@ -207,16 +211,17 @@ def compile_function(
     level: int | None = None,
     lanes: int = 1,
 ) -> CompiledFunction:
-    """Compile one CasADi function, or take it from the cache.
+    """Compile one CasADi function, or load it from the cache.
 
     Args:
         function: any function that CasADi can write as C; sparse inputs and outputs become dense.
-        cache: where libraries are kept; by default the user's (`codegen.cache.default_folder`).
-        level: optimisation level 0 to 3; by default by the size of the source.
-        lanes: evaluations of a batch that run side by side; 0 for what suits the machine.
+        cache: cache of the library; None for the user's (`codegen.cache.default_folder`).
+        level: optimisation level 0 to 3; None to choose by the size of the C text.
+        lanes: number of evaluations of a batch that run side by side; 0 for the machine's width.
 
     Raises:
-        CodegenError: there is no C compiler; or it cannot be generated, compiled, cached or loaded.
+        CodegenError: there is no C compiler, or the function cannot be generated, compiled, cached
+            or loaded.
     """
     source = CSource.of(function.name(), function, lanes, level)
     return _compiled([source], cache or Cache())[source.name][0].function()
@@ -231,18 +236,18 @@ def build(
     rebuild: bool = False,
     lanes: int = 1,
 ) -> Build:
-    """Compile a set of CasADi functions, several at once.
+    """Compile a set of CasADi functions in parallel, or load them from the cache.
 
     Args:
-        functions: by the name under which they are wanted.
-        cache: where libraries are kept; by default the user's.
-        key: under which `load_or_build` is to find them; None if it is not to.
-        levels: optimisation level per name, where the default by size is not wanted.
-        rebuild: compile also functions in the cache.
-        lanes: evaluations of a batch that run side by side; 0 for what suits the machine.
+        functions: CasADi functions by name.
+        cache: cache of the libraries; None for the user's.
+        key: key under which `load_or_build` finds the set later; None to store no such key.
+        levels: optimisation levels by name; the size of the C text decides the others.
+        rebuild: True to compile functions again that are in the cache.
+        lanes: number of evaluations of a batch that run side by side; 0 for the machine's width.
 
     Raises:
-        CodegenError: see `compile_function`.
+        CodegenError: as in `compile_function`.
     """
     cache = cache or Cache()
     sources = _sources_of(lambda: functions, levels or {}, lanes)
@@ -269,21 +274,21 @@ def load_or_build(
     lanes: int = 1,
     taped: bool = False,
 ) -> dict[str, NumericFunction]:
-    """Load or build a set of functions by the key of their ingredients.
+    """Load a set of functions that is stored under a key, or build and store the set.
 
-    Where the set was built before, with this compiler and these library versions, neither
-    expressions nor C are made again: `make` is not called and CasADi is not imported.
+    If this compiler and these library versions built the set before, `make` is not called and
+    CasADi is not imported.
 
     Args:
-        key: changes with everything that `make` depends on, except the version of CasADi.
-        make: makes the functions.
-        cache: where libraries are kept; by default the user's.
-        levels: optimisation level per name, where the default by size is not wanted.
-        lanes: evaluations of a batch that run side by side; 0 for what suits the machine.
-        taped: True to store functions of scalars as tapes, and compile the others alone.
+        key: digest of everything on which `make` depends, except the version of CasADi.
+        make: function that returns the CasADi functions by name; its errors are passed on.
+        cache: cache of the libraries; None for the user's.
+        levels: optimisation levels by name; the size of the C text decides the others.
+        lanes: number of evaluations of a batch that run side by side; 0 for the machine's width.
+        taped: True to store functions over SX as tapes and compile only the others.
 
     Raises:
-        CodegenError: see `compile_function`; also the errors of `make`.
+        CodegenError: as in `compile_function`.
         BridgeError: the module that runs tapes cannot be loaded.
     """
     cache = cache or Cache()
@@ -339,17 +344,16 @@ def _member(key: str, cache: Cache) -> Library | StoredTape | None:
 def load_or_compile(
     key: str, make: Callable[[], tuple[Signature, str]], cache: Cache | None = None
 ) -> NumericFunction:
-    """Load or compile a function written in C by hand, by the key of its ingredients.
+    """Load a handwritten C function that is stored under a key, or compile and store it.
 
     Args:
-        key: as of `load_or_build`.
-        make: its signature and its text (`codegen.source.handwritten_source`); not called where
-            the function was compiled before.
-        cache: where libraries are kept; by default the user's.
+        key: digest of everything on which `make` depends, except the version of CasADi.
+        make: function that returns signature and C text (`codegen.source.handwritten_source`). It
+            is called only if the cache lacks the function; its errors are passed on.
+        cache: cache of the library; None for the user's.
 
     Raises:
-        CodegenError: there is no C compiler; or it cannot be compiled, cached or loaded; and
-            Also the errors of `make`.
+        CodegenError: there is no C compiler, or the text cannot be compiled, cached or loaded.
     """
 
     cache = cache or Cache()
@@ -371,25 +375,25 @@ def load_or_build_program(
     cache: Cache | None = None,
     lanes: int = 0,
 ) -> ctypes.CDLL:
-    """Load or build several CasADi functions in lanes, and own C that calls them, as one library.
+    """Load or build one library of CasADi functions in lanes and of handwritten C that calls them.
 
-    For work in which calling through NumPy would cost more than the functions: intermediate results
-    stay in lanes and in the cache of the processor; see `codegen.source.program_source`.
+    This pays if calls through NumPy would cost more than the functions: intermediate results stay
+    in lanes. See `codegen.source.program_source`.
 
     Args:
-        name: for messages.
-        key: changes with everything that `make` depends on, except the version of CasADi.
-        make: makes the functions, by the names under which our C calls them.
-        own: our C, which follows the functions.
-        cache: where libraries are kept; by default the user's.
-        lanes: evaluations side by side; 0 for what suits the machine.
+        name: name of the program, for messages.
+        key: digest of everything on which `make` depends, except the version of CasADi.
+        make: function that returns the CasADi functions, by the names under which `own` calls them.
+        own: handwritten C, which follows the functions in the text.
+        cache: cache of the library; None for the user's.
+        lanes: number of evaluations side by side; 0 for the machine's width.
 
     Returns:
-        The library; `dual_arm_lanes()` says how many it has, and where that is one the machine has
-        no form in lanes and the library nothing else.
+        The library. Its C function `dual_arm_lanes()` returns the number of lanes; if that is 1,
+        the machine has no lanes and the library no other function.
 
     Raises:
-        CodegenError: as of `load_or_compile`; or a function has no form in lanes.
+        CodegenError: as in `load_or_compile`, or a function has no form in lanes.
     """
 
     cache = cache or Cache()
@@ -436,7 +440,10 @@ def _obtained(
     cache: Cache,
     load: Callable[[str, Cache], Member | None],
 ) -> dict[str, Member]:
-    """Load the members of a recipe: those that its record names, or those that are made."""
+    """Load all libraries or tapes that the record under `key` names, by name.
+
+    If the record or one of them is missing, make all and store the record.
+    """
 
     def find() -> dict[str, Member] | None:
         record = cache.read_record(key)
@@ -471,9 +478,9 @@ def _loaded(key: str, cache: Cache) -> Library | None:
 def _compiled(
     sources: Iterable[CSource], cache: Cache, *, rebuild: bool = False
 ) -> dict[str, tuple[Library, bool]]:
-    """Compile sources; return the libraries by name, and whether the cache already had them.
+    """Compile sources. Return for each name the library, and True if it was in the cache.
 
-    Compilers run side by side, and while the sources that follow are made.
+    Compilers run in parallel, already while later sources are generated.
     """
     compiler = compiler_of(cache)
     with ThreadPoolExecutor(available_cores()) as pool, interruptible():
@@ -496,8 +503,11 @@ def _compiled(
 def _begin(
     source: CSource, compiler: Compiler, cache: Cache, pool: ThreadPoolExecutor, rebuild: bool
 ) -> Future[tuple[Library, bool]]:
-    """Begin to compile a source. Submitted work starts in order: parts before the library that
-    needs them."""
+    """Start to compile a source in the pool.
+
+    The pool starts work in order, so the object files of separate functions are begun before the
+    library that links them.
+    """
     flags = () if source.lanes == 1 else LANE_FLAGS
     rest, parts = in_parts(source.text, source.lanes, source.most)
     # Names and shapes are part of the C text, except which of two equal layouts they mean.
@@ -546,10 +556,10 @@ def _begin(
 
 
 def _require_sound(compiler: Compiler, cache: Cache) -> None:
-    """Test a compiler before it compiles anything else; once per cache.
+    """Test a compiler before its first use with this cache.
 
     Raises:
-        CodegenError: it does not work, see `Compiler.self_test`.
+        CodegenError: the compiler fails `Compiler.self_test`.
     """
     key = key_of("compiler test", compiler=compiler.identity, flags=(*FLAGS, *LANE_FLAGS))
 

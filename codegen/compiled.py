@@ -135,10 +135,10 @@ class CompiledFunction(NumericFunction):
             future.result()
 
     def _require_shared(self, batched: Sequence[bool]) -> None:
-        """Refuse several values of an input that lanes share.
+        """Check that inputs with one value for all lanes have no value per evaluation.
 
         Raises:
-            CodegenError: there are some.
+            CodegenError: such an input has one value per evaluation.
         """
         for name, several, shared in zip(
             self.signature.input_names, batched, self._shared, strict=True
@@ -162,7 +162,11 @@ class CompiledFunction(NumericFunction):
         return run, lambda: self._native(begin_of_ports)
 
     def _native(self, of_batch: int) -> NativeCall:
-        """Return addresses for calls from C, with work memory of this thread."""
+        """Return the addresses with which C evaluates a batch, with work memory of this thread.
+
+        Args:
+            of_batch: address of the descriptions of arguments and results (`ports`).
+        """
         lanes = self._in_lanes if self.lanes > 1 else None
         own = [0, 0] if lanes is None else [lanes.address, lanes.own.address]
         return NativeCall(self._one.address, own[0], of_batch, self._one.own.address, own[1])

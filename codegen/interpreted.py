@@ -1,7 +1,7 @@
-"""CasADi's own evaluation, the oracle of the compiled functions: outputs and first derivatives.
+"""Evaluation of CasADi functions without compilation, as a reference for compiled functions.
 
-It also serves where a function is evaluated so few times that compiling it would take longer,
-unless it is a function of scalars, which runs from its tape (`codegen.tape`).
+The interpreter also replaces compilation if a function is evaluated so few times that compiling it
+would take longer. A scalar function (type SX) then runs from its tape (`codegen.tape`).
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ compared to this instead of to their own size."""
 
 
 class InterpretedFunction(NumericFunction):
-    """A CasADi function evaluated by its instructions: the same results, slower.
+    """A CasADi function evaluated by CasADi's interpreter.
 
     Attributes:
-        function: the CasADi function.
+        function: the CasADi function with dense inputs and outputs.
     """
 
     def __init__(self, function: ca.Function) -> None:
@@ -70,7 +70,7 @@ class InterpretedFunction(NumericFunction):
                 array[k] = one
 
     def _evaluator(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> Callable[[], None]:
-        """Bind the function to arrays that it reads and writes at each call."""
+        """Return a call without arguments that evaluates the function from and into these arrays."""
         buffer, evaluate = self.function.buffer()
         for i, array in enumerate(inputs):
             buffer.set_arg(i, array.data)
@@ -86,22 +86,25 @@ class InterpretedFunction(NumericFunction):
 
 
 def interpret(function: ca.Function) -> NumericFunction:
-    """Return a function that runs without a compiler: from its tape, or by CasADi."""
+    """Return a numeric function without compiling.
+
+    The function runs from its tape if it has one (`Tape.of`), else by CasADi's interpreter.
+    """
     tape = Tape.of(function)
     return InterpretedFunction(function) if tape is None else TapeFunction(tape)
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Worst relative differences of one function.
+    """Largest relative differences between a compiled function and CasADi's interpreter.
 
     Attributes:
-        name: of the function.
-        samples: random inputs tried.
-        outputs: worst difference of any output entry.
-        derivatives: worst difference of any entry of the derivative along a random direction of
+        name: name of the function.
+        samples: number of random inputs.
+        outputs: largest difference of any output entry.
+        derivatives: largest difference of any entry of the derivative along a random direction of
             all inputs.
-        worst_output: name of the output (or derivative) with the largest difference.
+        worst_output: name of the output, or of the derivative, with the largest difference.
     """
 
     name: str
@@ -125,16 +128,16 @@ def compare(
     samples: int = 20,
     cache: Cache | None = None,
 ) -> Agreement:
-    """Compare a compiled function, and its compiled derivative, with CasADi's own evaluation.
+    """Compare a compiled function and its compiled derivative with CasADi's interpreter.
 
     Args:
-        function: what `compiled` was made from.
+        function: the CasADi function from which `compiled` was made.
         compiled: the function to check.
-        bounds: by input name, between which limits inputs are drawn uniformly; the others are
+        bounds: by input name, lower and upper bounds of uniformly drawn inputs. Other inputs are
             standard normal.
-        rng: source of the inputs.
+        rng: random generator of the inputs.
         samples: number of random inputs.
-        cache: where the compiled derivative is kept.
+        cache: cache of the compiled derivative; None for the user's.
     """
     interpreted = InterpretedFunction(function)
     derivative = directional_derivative(function)
@@ -157,18 +160,18 @@ def compare(
 
 
 def directional_derivative(function: ca.Function) -> ca.Function:
-    """Build the directional derivative: the inputs, the outputs and a direction to the outputs'
-    slopes.
+    """Build the directional derivative of a function (CasADi's forward mode).
 
-    A random direction reaches every first derivative at the price of about two evaluations.
+    Its inputs are the function's inputs, its outputs at these inputs, and a direction with the
+    shapes of the inputs. Its outputs are the derivatives of the outputs along this direction.
     """
     return dense(function).forward(1)
 
 
 def relative_difference(reference: Array, other: Array) -> float:
-    """Compute the largest difference of two arrays over the reference's largest finite entry.
+    """Compute max abs(reference - other) over the largest finite abs(reference).
 
-    Infinite where NaN or infinite entries differ.
+    The divisor is at least `RESIDUE`. The result is infinite if NaN or infinite entries differ.
     """
     finite = np.isfinite(reference)
     if not np.array_equal(reference[~finite], other[~finite], equal_nan=True):

@@ -88,13 +88,15 @@ class CodePart:
 
 
 def in_parts(text: str, lanes: int, most: int = 3) -> tuple[str, tuple[CodePart, ...]]:
-    """Replace the parts of a C text of `codegen.source` by declarations. Return the text and the
-    parts, each once.
+    """Replace long functions of a C text by declarations, so that they are compiled separately.
 
     Args:
-        text: the C text.
+        text: C text from `codegen.source`.
         lanes: number of lanes of the text; 0 for the machine's width.
-        most: highest optimisation level of a part.
+        most: highest optimisation level of a separate function.
+
+    Returns:
+        The text with declarations, and the removed functions, each once.
     """
     before = {
         "casadi": _preamble(*(["one_lane.h"] if "dual_arm_sin" in text else []), "part.h"),

@@ -94,7 +94,12 @@ def handwritten_source(
 
 
 def program_source(functions: Mapping[str, ca.Function], own: str, lanes: int = 0) -> str:
-    """Generate the C text of functions in lanes, followed by own C that calls them.
+    """Generate the C text of CasADi functions in lanes, followed by handwritten C that calls them.
+
+    Args:
+        functions: CasADi functions, by the names under which `own` calls them.
+        own: the handwritten C.
+        lanes: number of lanes; 0 for the width of the machine that compiles.
 
     Raises:
         CodegenError: CasADi cannot write a function as C, or its C cannot be translated to lanes.
@@ -117,9 +122,12 @@ def _lanes_header(lanes: int) -> list[str]:
 
 
 def _lane_functions(functions: Mapping[str, ca.Function]) -> Iterator[str]:
-    """Yield the C of every function `f` as `f(arg, res, iw, w)` over `lanes_real`, with its sizes
-    of memory as f_ARG, f_RES, f_IW and f_W, the size of its k-th result as f_OUT_k, and as
-    f_SHARED whether it takes `SHARED_SUFFIX` arguments as numbers instead of lanes."""
+    """Yield the C of functions in lanes, each as `NAME(arg, res, iw, w)` over `lanes_real`.
+
+    Macros state the sizes of the work memory (NAME_ARG, NAME_RES, NAME_IW, NAME_W) and of result k
+    (NAME_OUT_k). NAME_SHARED is 1 if arguments named with `SHARED_SUFFIX` are passed as plain
+    numbers, else 0.
+    """
     for name, function in functions.items():
         whole = dense(function)
         shared = shared_inputs(whole)
@@ -140,10 +148,10 @@ SHARED_SUFFIX = "_numbers"
 
 
 def shared_inputs(function: ca.Function) -> tuple[int, ...]:
-    """Return the indices of the inputs that a function in lanes takes as plain numbers.
+    """Return the indices of the inputs of a function that have one value for all lanes.
 
-    These are the inputs of straight functions whose name ends in `SHARED_SUFFIX`. Other functions
-    pass their arguments on in lanes.
+    These are the inputs of functions over SX whose names end in `SHARED_SUFFIX`. Functions over MX
+    have none.
     """
     straight = function.is_a("SXFunction")
     names = enumerate(function.name_in())
@@ -151,10 +159,10 @@ def shared_inputs(function: ca.Function) -> tuple[int, ...]:
 
 
 def generated_c(functions: Sequence[ca.Function]) -> str:
-    """Generate CasADi's C of dense functions, at least one.
+    """Generate CasADi's C text of one or more dense functions.
 
     Raises:
-        CodegenError: CasADi cannot write one of them as C.
+        CodegenError: CasADi cannot write one of the functions as C.
     """
     name = functions[0].name()
     try:

@@ -1,8 +1,9 @@
-"""Functions of scalars run without a compiler: CasADi's instructions over many samples at once.
+"""Run scalar CasADi functions (type SX) without a compiler, for many samples at once.
 
-A compiler takes seconds over a function of ten thousand instructions; their tape is written down
-in milliseconds. `tape.cpp` decodes an instruction once and runs it over up to 32 samples, with the
-bits of a function that is compiled in lanes. One evaluation takes as long as eight.
+A compiler needs seconds for a function of ten thousand instructions; listing the instructions (the
+tape) takes milliseconds. `tape.cpp` decodes each instruction once and runs it for up to 32 samples.
+The results have the same bits as those of a function compiled in lanes. One evaluation takes as
+long as eight.
 """
 
 from __future__ import annotations
@@ -32,22 +33,22 @@ output the operands are its place."""
 
 @cache
 def compiled_tape() -> Any:
-    """Load the compiled module.
+    """Load the C++ extension module that runs tapes.
 
     Raises:
-        BridgeError: it is missing or cannot be loaded.
+        BridgeError: the module is missing or cannot be loaded.
     """
     return compiled_module("codegen._tape", "the compiled part of the interpreter")
 
 
 @dataclass(frozen=True)
 class Tape:
-    """The instructions of a function of scalars.
+    """The instructions of a scalar CasADi function (type SX).
 
     Attributes:
-        signature: of the function.
-        instructions: (n,) in the order in which they run.
-        slots: numbers that are kept between instructions.
+        signature: names and shapes of the function's inputs and outputs.
+        instructions: (n,) records in the order in which they run.
+        slots: number of intermediate values in the work memory.
     """
 
     signature: Signature
@@ -56,8 +57,10 @@ class Tape:
 
     @classmethod
     def of(cls, function: ca.Function) -> Tape | None:
-        """Return the tape of a CasADi function, with sparse inputs and outputs as dense; None if
-        it is no function of scalars, or has an operation that `tape.cpp` lacks.
+        """Return the tape of a CasADi function; sparse inputs and outputs become dense.
+
+        The result is None if the function is not of type SX, or has an operation that `tape.cpp`
+        lacks.
 
         Raises:
             BridgeError: the compiled module cannot be loaded.
@@ -101,7 +104,7 @@ class Tape:
 
     @cached_property
     def program(self) -> Any:
-        """The instructions as `tape.cpp` runs them."""
+        """The instructions as an object of the extension module, which runs them."""
         count = len(self.signature.input_names)
         found = (self.instructions[name] for name in ("code", "constant"))
         codes, constants = map(np.ascontiguousarray, found)
@@ -109,19 +112,25 @@ class Tape:
 
     @classmethod
     def load(cls, path: Path, signature: Signature, slots: int) -> Tape:
-        """Read the instructions from a file of `save`."""
+        """Read the instructions from a file that `save` wrote.
+
+        Args:
+            path: the file.
+            signature: signature of the function.
+            slots: number of intermediate values in the work memory.
+        """
         return cls(signature, np.load(path, allow_pickle=False), slots)
 
     def save(self, path: Path) -> None:
-        """Write the instructions into a file."""
+        """Write the instructions, without signature and slots, to a NumPy file."""
         np.save(path, self.instructions, allow_pickle=False)
 
 
 class TapeFunction(NumericFunction):
-    """A function of scalars that runs from its tape. Safe to call from several threads.
+    """A numeric function that runs from its tape. Several threads may call it at once.
 
     Attributes:
-        tape: its instructions.
+        tape: the instructions of the function.
     """
 
     def __init__(self, tape: Tape) -> None:

@@ -39,19 +39,24 @@ def convex_pieces(path: Path, scale: Array) -> tuple[Hull, ...]:
 
     Args:
         path: a file in one of `FORMATS`.
-        scale: (3,) factor per axis.
+        scale: (3,) scale factors along x, y and z.
 
     Raises:
-        CollisionModelError: unreadable, empty, flat, with non-finite vertices, or enormous.
+        CollisionModelError: the mesh cannot be read, is empty, flat or too large, has non-finite
+            vertices, or a part of it has no convex hull.
     """
     return cut(read_mesh(path, scale), path).hulls
 
 
 def cut(mesh: trimesh.Trimesh, path: Path) -> CutMesh:
-    """Decompose a mesh of `read_mesh` into few convex pieces; `path` names it in messages.
+    """Decompose a mesh into few convex hulls whose union contains the mesh.
+
+    Args:
+        mesh: mesh from `read_mesh` [m].
+        path: file of the mesh, for messages.
 
     Raises:
-        CollisionModelError: a part has no convex hull.
+        CollisionModelError: a part of the mesh has no convex hull.
     """
     pieces: list[Hull] = []
     open_components = coarse_components = 0
@@ -93,10 +98,9 @@ def cut(mesh: trimesh.Trimesh, path: Path) -> CutMesh:
 
 
 def _may_be_cut(triangles: Array, filled: float) -> bool:
-    """Return True if `decompose` might cut a component that has holes, once these were closed.
+    """Return True if `decompose` might cut a component with holes after its holes are closed.
 
-    The result False is certain: triangles that close a hole only enlarge the hulls of both halves
-    of a cut.
+    False is certain: triangles that close a hole only enlarge the hulls of both halves of a cut.
 
     Args:
         triangles: (n, 3, 3) corners of the component's triangles [m].
@@ -123,8 +127,10 @@ LARGE_PARTS = 24
 
 
 def _parts(mesh: trimesh.Trimesh) -> tuple[list[trimesh.Trimesh], list[NDArray[np.intp]]]:
-    """Return the components of a mesh that become pieces, and the faces of each one that does
-    not."""
+    """Return the components of a mesh that become hulls of their own, and the others.
+
+    Each of the others is an array of face indices.
+    """
     nodes = np.arange(len(mesh.faces))
     parts = list(trimesh.graph.connected_components(mesh.face_adjacency, nodes=nodes, min_len=1))
     large = len(parts)
@@ -138,7 +144,11 @@ def _parts(mesh: trimesh.Trimesh) -> tuple[list[trimesh.Trimesh], list[NDArray[n
 
 
 def _thickened(triangles: Array) -> Array:
-    """Return the corners of a flat surface, moved both ways along every axis."""
+    """Return the corners (n, 6, 3) of a flat surface, moved both ways along every axis [m].
+
+    Args:
+        triangles: corners of the surface's triangles, any shape (..., 3) [m].
+    """
     steps = SMALLEST_SIZE * np.concatenate([np.eye(3), -np.eye(3)])
     return np.asarray(triangles.reshape(-1, 1, 3) + steps, dtype=float)
 
@@ -159,7 +169,7 @@ WORTHWHILE = 0.05
 
 
 def hull_of(points: Array) -> Hull:
-    """Compute the convex hull of points, with faces oriented outwards."""
+    """Compute the convex hull of points (..., 3) [m], with faces oriented outwards."""
     hull = ConvexHull(points.reshape(-1, 3))
     vertices = hull.points[hull.vertices]
     index = np.full(len(hull.points), -1)
@@ -175,11 +185,13 @@ def hull_of(points: Array) -> Hull:
 
 
 def decompose(triangles: Array, solid: float) -> list[Hull]:
-    """Cut a surface greedily, always the part whose best cut removes the most empty volume.
+    """Cut a closed surface by planes into parts, and return the convex hull of each part.
+
+    Each step cuts the part whose best cut reduces the total volume of the hulls most.
 
     Args:
-        triangles: (n, 3, 3) of a watertight surface.
-        solid: the volume that it encloses [m^3].
+        triangles: (n, 3, 3) corners of the triangles of a watertight surface [m].
+        solid: volume inside the surface [m^3].
     """
     whole = hull_volume(triangles)
     if whole - solid < WORTHWHILE * whole:
@@ -195,7 +207,7 @@ def decompose(triangles: Array, solid: float) -> list[Hull]:
 
 
 def hull_volume(triangles: Array) -> float:
-    """Compute the volume of the convex hull; zero if it is flat."""
+    """Compute the volume [m^3] of the convex hull of triangles (n, 3, 3) [m]; 0 for a flat hull."""
     try:
         return float(ConvexHull(triangles.reshape(-1, 3)).volume)
     except (QhullError, ValueError):
@@ -203,7 +215,15 @@ def hull_volume(triangles: Array) -> float:
 
 
 def _best_cut(triangles: Array) -> tuple[float, tuple[Array, ...]]:
-    """Return the gain [m^3] of the best plane across a coordinate axis, and the two halves."""
+    """Find the plane across a coordinate axis that reduces the volume of the hulls most.
+
+    Args:
+        triangles: (n, 3, 3) corners of triangles [m].
+
+    Returns:
+        The reduction [m^3], and the triangles of both halves; (0, ()) if no plane reduces the
+        volume.
+    """
     volume = hull_volume(triangles)
     lower, upper = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
     best: tuple[float, tuple[Array, ...]] = (0.0, ())
@@ -217,8 +237,14 @@ def _best_cut(triangles: Array) -> tuple[float, tuple[Array, ...]]:
 
 
 def _clip(triangles: Array, axis: int, level: float, side: float) -> Array:
-    """Return the parts of triangles (n, 3, 3) with side * (coordinate - level) >= 0, as
-    triangles."""
+    """Cut triangles (n, 3, 3) at a plane and return the triangles on one side.
+
+    Args:
+        triangles: (n, 3, 3) corners [m].
+        axis: index of the coordinate axis across which the plane lies.
+        level: coordinate of the plane [m].
+        side: 1 for the side of larger coordinates, -1 for the other side.
+    """
     height = side * (triangles[:, :, axis] - level)
     inside = height >= 0.0
     count = inside.sum(axis=1)
@@ -260,11 +286,11 @@ START_DIRECTIONS = np.array([u for u in product((-1.0, 0.0, 1.0), repeat=3) if a
 
 
 def simplify(hulls: list[Hull]) -> tuple[Hull, ...]:
-    """Return fewer hulls with fewer corners, whose union contains all of the given ones.
+    """Return fewer hulls with fewer corners, whose union contains all given hulls.
 
-    Hulls inside another are dropped: duplicates, screws and bearings inside a housing. One that
-    stands out from a larger one by at most `STAND_OUT`, and small ones near each other, are joined:
-    their common hull takes their place. Each is then thinned, see `thin`.
+    A hull inside another hull is dropped. The common hull replaces two hulls if the smaller one
+    stands out from the larger one by at most `STAND_OUT`, or if both together are at most
+    `SMALL_PART` long. `thin` then removes corners of each hull.
     """
     kept: dict[int, _Growth] = {}
     volumes = [hull_volume(hull.vertices[hull.faces]) for hull in hulls]
@@ -282,12 +308,12 @@ def simplify(hulls: list[Hull]) -> tuple[Hull, ...]:
 
 
 def thin(hull: Hull) -> Hull:
-    """Return a hull of fewer corners that contains a hull, and stands out from it by at most
-    `STAND_OUT`.
+    """Return a hull with fewer corners that contains `hull` and exceeds it by at most `STAND_OUT`.
 
-    Some corners are kept and moved outwards by a linear map. They suffice once the hull of the
-    kept ones contains what the map moves to the corners: the map of one then contains the other.
-    The hull is returned as it is if that saves few corners.
+    A linear map moves every face of the hull outwards. Corners are selected until their convex hull
+    contains the preimage of all corners under the map. The map of this convex hull then contains
+    the given hull. The given hull itself is returned if more than `THINNED_SHARE` of its corners
+    would be kept.
     """
     growth, corners = _Growth(hull), hull.vertices
     seeds = np.unique(np.argmax(corners @ growth.axes @ START_DIRECTIONS.T, axis=0))
@@ -310,14 +336,15 @@ def thin(hull: Hull) -> Hull:
 
 
 class _Growth:
-    """A linear map about the middle of a hull that moves none of its points farther than
-    `STAND_OUT`, and every face outwards: it stretches the hull along its principal axes.
+    """A linear map that stretches a hull about its middle, along its principal axes.
+
+    The map moves every face outwards, and no point of the hull farther than `STAND_OUT`.
 
     Attributes:
         hull: the hull.
-        planes: (n, 4) of its faces: outward normal and offset.
-        axes: (3, 3) principal axes of its corners as columns.
-        preimage: (m, 3) points that the map moves to its corners.
+        planes: (n, 4) outward unit normal and offset [m] of each face.
+        axes: (3, 3) principal axes of the hull's corners, as columns.
+        preimage: (m, 3) points that the map moves to the hull's m corners [m].
     """
 
     def __init__(self, hull: Hull) -> None:
@@ -338,11 +365,15 @@ class _Growth:
         return self._stretched(points, self._factors)
 
     def hull_contains(self, points: Array) -> bool:
-        """Return True if all points (n, 3) are in the hull."""
+        """Return True if the hull, not stretched, contains all points (n, 3) [m]."""
         return not _beyond(points, self.planes)
 
     def takes_in(self, points: Array) -> bool:
-        """Return True if the hull may be replaced by the common one with points (n, 3)."""
+        """Return True if a common hull may replace the hull and the convex hull of points (n, 3).
+
+        This holds if the stretched hull contains the points, or if all fit into a cube with the
+        edge `SMALL_PART`.
+        """
         both = np.stack([points.min(axis=0), self.hull.vertices.min(axis=0)])
         high = np.maximum(points.max(axis=0), self.hull.vertices.max(axis=0))
         if np.all(high - both.min(axis=0) <= SMALL_PART):
@@ -355,5 +386,5 @@ class _Growth:
 
 
 def _beyond(points: Array, planes: Array) -> bool:
-    """Return True if a point (n, 3) is beyond one of the planes (m, 4)."""
+    """Return True if any of the points (n, 3) is outside of any of the planes (m, 4)."""
     return bool(np.any(points @ planes[:, :3].T + planes[:, 3] > ROUNDOFF))

@@ -1,8 +1,9 @@
-"""Numbers behind the bounds of distances and motions: covers, obstacles, reach.
+"""Numbers of all bodies from which bounds of distances and motions are computed.
 
-NumPy computes them once per cell. `symbolic.geometry.clearance` builds expressions of them, with
-arrays or symbols as values (`symbolic.parameters.CellParameters`). The choice of a pair's bound
-depends on these numbers too, and is stored as flags.
+NumPy computes these numbers once per cell: simple shapes that contain each body, extents of
+obstacles, and distances of body points from joint axes. `symbolic.geometry.clearance` builds
+expressions from them; they may be arrays or symbols (`symbolic.parameters.CellParameters`). Flags
+store which kind of bound each pair gets.
 """
 
 from __future__ import annotations
@@ -43,10 +44,10 @@ Along the world's axes a slanted body seems wider by up to this much."""
 
 @dataclass(frozen=True)
 class CoverSolid:
-    """A simple shape in a frame.
+    """A box, sphere, cylinder or capsule in a frame.
 
     Attributes:
-        kind: name of the shape.
+        kind: class of the shape.
         size: half edges (3,) of a box, or radius and half length (2,) of another shape [m].
         centre: centre (3,) of the shape in the frame [m].
         rotation: axes (3, 3) of the shape as columns; None for the axes of the frame.
@@ -63,7 +64,7 @@ class ScreenChain:
     """A chain of equal spheres.
 
     Attributes:
-        centres: (n, 3) in a frame [m].
+        centres: (n, 3) centres of the spheres in the body's frame or in the world [m].
         radius: (1,) radius of each sphere [m].
     """
 
@@ -73,14 +74,14 @@ class ScreenChain:
 
 @dataclass(frozen=True)
 class Reach:
-    """Distances that bound how a body moves with its frame.
+    """Distances that limit how far the points of a body move when its frame or joints move.
 
     Attributes:
-        centre: (3,) centre of the body's bounding box [m].
-        spans: (2,) largest distance of the body's points from this centre, and from the frame's
-            origin [m].
-        joints: for each joint before the body the largest distance of its points from the joint's
-            axis [m]; 1 for a sliding joint.
+        centre: (3,) centre of the body's bounding box in the body's frame [m].
+        spans: (2,) largest distance of the body's points from `centre`, and from the frame's origin
+            [m].
+        joints: (k,) for each of the k joints that move the body, an upper bound of the distance of
+            the body's points from the joint's axis [m]; 1 for a sliding joint.
     """
 
     centre: Array
@@ -90,16 +91,15 @@ class Reach:
 
 @dataclass(frozen=True)
 class Obstacle:
-    """A fixed convex piece.
+    """A fixed convex piece of the environment.
 
     Attributes:
-        kind: kind of the shape.
-        axes: (3, 3) directions along which a box is compared, as rows; None for the world's axes.
-        extent: (2, 3) least and largest coordinate along these directions [m].
-        cover: a simple shape that contains the piece.
-        to_own: (3, 3) rotation from the world to the piece's own axes; None if these are the
-            world's axes.
-        offset: position (3,) of the world's origin in the piece's own axes [m].
+        kind: class of the shape.
+        axes: (3, 3) directions, as rows, along which a box is compared; None for the world's axes.
+        extent: (2, 3) least and largest coordinate of the piece along these directions [m].
+        cover: a simple shape in the world that contains the piece.
+        to_own: (3, 3) rotation from the world to the piece's own axes; None for the identity.
+        offset: position (3,) of the world's origin in the piece's frame [m].
     """
 
     kind: type
@@ -118,19 +118,20 @@ class ScreenBody(ContentRecord):
         group: group of the `CollisionBody`.
         frame: frame to which the body is fixed; 'world' with a robot's index for bodies at the
             robot's base.
-        cover: simple shapes that contain the body, in this frame or in the frame of the base; ()
-            for an obstacle.
-        chain: chain of spheres that contains the body, in this frame or in the world; None for an
-            obstacle.
-        extent: (2 n + 2, 3) for a body at a base: least and largest coordinates in the world of the
-            whole body, then of each of n simple shapes [m].
-        reach: distances that bound the body's motion; None if the body does not move.
-        pieces: pose of each piece in the frame: rotation (3, 3), None for the identity, and centre
-            (3,) [m]; for a body that does not move the quaternion (4,) in the world and the centre.
-        obstacles: pieces of a fixed body of the environment.
-        slanted: whether obstacles are also compared along the body's own axes.
-        is_constant: whether the numbers follow from files alone: the body is a link, or a mesh that
-            moves.
+        cover: simple shapes that contain the body, in `frame` or, for a body at a base, in the base
+            frame; () for an obstacle.
+        chain: chain of spheres that contains the body, in `frame`; in the world for a body at a
+            base; None for an obstacle.
+        extent: (2 n + 2, 3) for a body at a base: least and largest world coordinates of the whole
+            body, then of each of its n simple shapes [m]; else None.
+        reach: distances that limit the body's motion; None if the body does not move.
+        pieces: rotation and centre (3,) [m] of each piece. For a moving body the rotation is a
+            matrix (3, 3) in `frame`, or None for the identity; for a fixed body a quaternion (4,),
+            w x y z, in the world.
+        obstacles: the pieces of a body of the environment; () for other bodies.
+        slanted: whether distances to obstacles are also bounded along the body's own axes.
+        is_constant: whether the numbers follow from files alone. This holds for links, and for
+            moving bodies with meshes.
     """
 
     group: str
@@ -150,8 +151,8 @@ class ScreenBase:
     """Pose of an arm's base in the world.
 
     Attributes:
-        rotation: (3, 3).
-        position: (3,) [m].
+        rotation: (3, 3) rotation from the base to the world.
+        position: (3,) origin of the base in the world [m].
     """
 
     rotation: Any
@@ -165,14 +166,15 @@ class Screen:
     Attributes:
         bases: pose of each arm's base.
         turning: for each arm, True for each joint that turns, False for one that slides.
-        bodies: all bodies, in the geometry's order.
-        pairs: indices of both bodies of each possible pair.
-        own: for each pair of one arm whether it gets the finer bound; None for other pairs.
+        bodies: all bodies, in the order of `CellGeometry.bodies`.
+        pairs: indices of the two bodies of each possible pair (`CellGeometry.possible`).
+        own: for each pair of bodies of one arm, whether its bound compares the bodies piece by
+            piece; None for other pairs.
         payload: bounding box of the payload.
-        payload_is_mesh: whether this box follows from a file.
-        between: (3, 3) directions as rows, the first from one base to the other; None if the
-            world's axes are used.
-        given: the numbers as one group if they are symbols.
+        payload_is_mesh: whether the payload is a mesh.
+        between: (3, 3) directions as rows, the first from base 1 to base 2; None for the world's
+            axes.
+        given: the parameter group that holds the numbers if they are symbols; else None.
     """
 
     bases: tuple[ScreenBase, ScreenBase]
@@ -187,7 +189,7 @@ class Screen:
 
 
 def screen_of(geometry: CellGeometry) -> Screen:
-    """Compute the screen of a cell's bodies and possible pairs."""
+    """Compute the numbers for bounds of distances and motions of a cell's bodies and pairs."""
     bodies, arms = geometry.bodies, geometry.arms
     pairs = tuple((pair.first, pair.second) for pair in geometry.possible)
     close = close_pairs(geometry)
@@ -303,7 +305,7 @@ def _obstacle(piece: Piece) -> Obstacle:
 
 
 def _extent(piece: Piece, A: Array) -> Array:
-    """Compute the least and largest coordinates (2, 3) along the rows of A (3, 3) [m]."""
+    """Compute the least and largest coordinates (2, 3) [m] of a piece along the rows of A (3, 3)."""
     return np.stack([-support(piece, -A), support(piece, A)])
 
 
@@ -320,11 +322,12 @@ def _reach(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> Reach:
 
 
 def reach_about_joints(body: CollisionBody, arm: ArmGeometry) -> Array:
-    """Compute upper bounds (n,) of the distances of a link's body from each joint's axis [m]; 1 for
-    a prismatic joint.
+    """Compute upper bounds (n,) of the distances of a link's points from the axis of each joint
+    [m].
 
-    The bound is zero for joints behind the body, which do not move it. For the body's own joint it
-    follows from the shape. For earlier joints the chain of links between is taken as stretched.
+    The entry of a prismatic joint is 1. The entry of a joint that does not move the link is 0. For
+    the link's own joint the bound follows from the shape; for earlier joints the chain of links in
+    between is assumed stretched.
     """
     reach = np.zeros(arm.joints)
     last = body.frame.joint
