@@ -70,7 +70,9 @@ class InterpretedFunction(NumericFunction):
                 array[k] = one
 
     def _evaluator(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> Callable[[], None]:
-        """Return a call without arguments that evaluates the function from and into these arrays."""
+        """Return a call without arguments that evaluates the function from `inputs` into
+        `outputs`.
+        """
         buffer, evaluate = self.function.buffer()
         for i, array in enumerate(inputs):
             buffer.set_arg(i, array.data)

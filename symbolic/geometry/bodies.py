@@ -52,12 +52,12 @@ class CollisionBody(ContentRecord):
 
     Attributes:
         name: name in the workcell file for environment bodies; 'robot/link' for links and tools.
-        group: one of the four groups of the cell: robot 1, robot 2, payload, environment.
+        group: 'robot 1', 'robot 2', 'payload' or 'environment'.
         frame: frame to which the body is fixed.
         pieces: convex pieces of the body, in this frame.
         is_tool: whether the body is part of a robot's tool.
-        carries: indices of the arms of a machine that are mounted on this link
-            (`symbolic.read.arms.ArmLinks`); None if the body is not a link or carries no arm.
+        carries: indices of the arms that are mounted on this link (`symbolic.read.arms.ArmLinks`);
+            None if the body is not a link or carries no arm.
         root: for a link that does not move, the index of the robot and the pieces in the robot's
             root frame; else None.
     """
@@ -181,8 +181,7 @@ def arm_geometry(workcell: Workcell, i: int) -> ArmGeometry:
 
 
 def _check_effort(bodies: list[CollisionBody], most_pieces: int) -> None:
-    """Check that the number of pieces and corners is small enough for sorting the pairs in some
-    seconds."""
+    """Check that the bodies have few enough pieces to decide on all pairs in seconds."""
     pieces = sum(len(body.pieces) for body in bodies)
     largest = max(bodies, key=lambda body: len(body.pieces))
     if pieces > most_pieces:
@@ -234,7 +233,7 @@ def _robot_bodies(robot: Robot, i: int, links: ArmLinks, meshes: MeshReader) -> 
 def _standing_bodies(
     robots: tuple[Robot, Robot], i: int, links: tuple[ArmLinks, ArmLinks], meshes: MeshReader
 ) -> list[CollisionBody]:
-    """Return the bodies of arm i's machine that do not move."""
+    """Return the links of arm i's machine that do not move, as bodies."""
     robot, bodies = robots[i], []
     if not robot.chain_root:
         return []
@@ -292,8 +291,9 @@ def _located(mesh: UrdfMesh, robot: Robot, owner: str) -> Mesh:
 
 
 class MeshReader:
-    """Reader of a cell's meshes. Each mesh is read and decomposed once. All together may have at
-    most `MOST_CELL_FACES` triangles.
+    """Reader of a cell's meshes. Each mesh is read and decomposed once.
+
+    All meshes together may have at most `MOST_CELL_FACES` triangles.
 
     Attributes:
         known: decomposed meshes by file and scale.
@@ -352,7 +352,14 @@ def _cut_file(path: Path, scale: tuple[float, ...], state: tuple[int, int]) -> C
 def shape_pieces(
     shape: Shape | Capsule, pose: Array, owner: str, meshes: MeshReader
 ) -> tuple[Piece, ...]:
-    """Return the convex pieces of a shape at a pose (4, 4)."""
+    """Return the convex pieces of a shape.
+
+    Args:
+        shape: the shape.
+        pose: (4, 4) of the shape in its body's frame.
+        owner: name of the body, for messages.
+        meshes: reader of the meshes.
+    """
     if not isinstance(shape, Mesh):
         return (Piece(shape, pose),)
     try:

@@ -109,11 +109,11 @@ def screening_functions(
 
 
 def _piece_pose(placed: tuple[ca.SX, ca.SX] | None, turn: Any, centre: Any) -> tuple[ca.SX, ca.SX]:
-    """Compute the unit quaternion (4,) and the position (3,) of a piece of `ScreenBody.pieces` in
-    the world.
+    """Compute the unit quaternion (4,) and the position (3,) [m] of a piece in the world.
 
     Args:
-        placed: rotation and position of the piece's frame; None if the piece does not move.
+        placed: rotation (3, 3) and position (3,) of the piece's frame; None if the piece is fixed.
+        turn, centre: the piece's entry in `ScreenBody.pieces`.
     """
     position = ca.SX(number(centre))
     if placed is None:
@@ -130,8 +130,9 @@ BOX_NUMBERS = 15
 
 
 def box_numbers(body: CollisionBody) -> Array:
-    """Return a fixed box as numbers (BOX_NUMBERS,): rotation (3, 3), centre (3,) and half edges
-    (3,)."""
+    """Return the rotation (3, 3), centre (3,) and half edges (3,) of a fixed box in the world as
+    one array (BOX_NUMBERS,) [m].
+    """
     (piece,) = body.pieces
     assert isinstance(piece.shape, Box)
     half = np.asarray(piece.shape.size) / 2.0
@@ -139,7 +140,7 @@ def box_numbers(body: CollisionBody) -> Array:
 
 
 class DistanceBounds:
-    """Expressions of distance bounds of one sample. Each expression is built once and shared."""
+    """Builder of distance bounds at one sample, as expressions. Each expression is built once."""
 
     def __init__(
         self,
@@ -175,7 +176,11 @@ class DistanceBounds:
         self._chains: dict[int, list[ca.SX]] = {}
 
     def bound(self, pair: int) -> ca.SX:
-        """Compute a lower bound of the distance between the bodies of a possible pair."""
+        """Compute a lower bound of the distance between the bodies of a pair [m].
+
+        Args:
+            pair: index of the pair among the possible pairs.
+        """
         i, j = self.screen.pairs[pair]
         first, second = self.screen.bodies[i], self.screen.bodies[j]
         if second.obstacles:
@@ -195,18 +200,22 @@ class DistanceBounds:
         return self.soft.maximum_below(gaps)
 
     def separable(self, pair: int) -> bool:
-        """Return True if a possible pair consists of the payload, a box, and an obstacle that is a
-        single box."""
+        """Return True if a pair is the payload and a body of the environment that is a single box.
+
+        Args:
+            pair: index of the pair among the possible pairs.
+        """
         first, second = (self.screen.bodies[body] for body in self.screen.pairs[pair])
         kinds = [obstacle.kind for obstacle in second.obstacles]
         return first.group == "payload" and kinds == [Box]
 
     def separation(self, obstacle: ca.SX, direction: ca.SX) -> ca.SX:
-        """Compute the gap between the payload and a fixed box along a direction.
+        """Compute a lower bound of the gap between the payload and a fixed box along a direction
+        [m].
 
         Args:
             obstacle: numbers (BOX_NUMBERS,) of the fixed box from `box_numbers`; may be symbols.
-            direction: (3,) unit vector from the box towards the payload.
+            direction: (3,) unit vector in the world, from the fixed box towards the payload.
         """
         rotation, centre = ca.reshape(obstacle[:9], 3, 3).T, obstacle[9:12]
         half = obstacle[12:]
@@ -226,12 +235,15 @@ class DistanceBounds:
         return list(zip(self._interval(i, axes), self._interval(j, axes), strict=True))
 
     def _gap(self, pairs: Sequence[tuple[Interval, Interval]]) -> ca.SX:
-        """Compute the largest gap over several directions, from the intervals of both bodies along
-        each direction."""
+        """Compute the largest gap [m] over several directions.
+
+        Args:
+            pairs: for each direction the intervals of both bodies along it [m].
+        """
         return self.soft.maximum_below(_gaps(pairs))
 
     def _interval(self, index: int, axes: Axes) -> list[Interval]:
-        """Compute the extent of a body along each direction."""
+        """Compute the least and largest coordinate of a body along each of three directions [m]."""
         key = (index, axes.key)
         body = self.screen.bodies[index]
         if body.extent is not None and axes is self._world:
@@ -249,16 +261,25 @@ class DistanceBounds:
         return self._intervals[key]
 
     def _piece_interval(self, A: ca.SX, offset: ca.SX, piece: CoverSolid) -> list[Interval]:
-        """Compute the extent of a cover piece along the rows of A, with the origin of the piece's
-        frame at `offset`."""
+        """Compute the least and largest coordinate of a cover piece along three directions [m].
+
+        Args:
+            A: (3, 3) the directions as rows, in the axes of the piece's frame.
+            offset: (3,) coordinates of the frame's origin along the directions [m].
+            piece: the cover piece.
+        """
         middle = ca.mtimes(A, ca.SX(number(piece.centre))) + offset
         seen = A if piece.rotation is None else ca.mtimes(A, turned(piece.rotation))
         reach = [self._reach(seen[k, :], piece) for k in range(3)]
         return [(middle[k] - reach[k], middle[k] + reach[k]) for k in range(3)]
 
     def _reach(self, u: ca.SX, piece: CoverSolid) -> ca.SX:
-        """Compute the largest extent of a piece from its centre along u (1, 3), in the piece's own
-        axes."""
+        """Compute the largest distance of a piece's points from its centre along a direction [m].
+
+        Args:
+            u: (1, 3) unit vector in the piece's own axes.
+            piece: the cover piece.
+        """
         size = ca.SX(number(piece.size))
         if piece.kind is Box:
             return sum((size[k] * self.soft.entry_above(u[k]) for k in range(3)), ca.SX(0))
@@ -270,7 +291,9 @@ class DistanceBounds:
         return axial + size[0]
 
     def _seen(self, frame: Frame, axes: Axes) -> tuple[ca.SX, ca.SX]:
-        """Compute the rotation and position of a frame in coordinates along the axes."""
+        """Compute a frame's rotation (3, 3) and origin (3,) [m], in coordinates along three
+        directions.
+        """
         key = (frame, axes.key)
         if key not in self._relative:
             R, p = self._placed[frame]
@@ -282,7 +305,7 @@ class DistanceBounds:
         return Axes(str(frame), self._placed[frame][0].T)
 
     def _chain(self, index: int) -> tuple[list[ca.SX], ca.SX]:
-        """Compute the centres, in the world, and the radius of a body's chain of spheres."""
+        """Compute the centres (3,) in the world and the common radius of a body's spheres [m]."""
         body = self.screen.bodies[index]
         assert body.chain is not None, "obstacles have no chains"
         if index not in self._chains:
@@ -298,14 +321,19 @@ class DistanceBounds:
         return self.soft.norm_below(self.soft.minimum_below(squared))
 
     def _chain_bound(self, i: int, j: int) -> ca.SX:
-        """Return a lower bound of the distance of two chains of spheres: the distance of the
-        nearest centres minus both radii."""
+        """Return a lower bound of the distance of bodies i and j by their chains of spheres [m].
+
+        The bound is the distance of the nearest centres minus both radii.
+        """
         (first, r_1), (second, r_2) = self._chain(i), self._chain(j)
         return self._nearest([ca.sumsqr(a - b) for a in first for b in second]) - (r_1 + r_2)
 
     def _near_bound(self, i: int, j: int) -> ca.SX:
-        """Return a lower bound of the distance of two bodies piece by piece, along the axes of the
-        first body's frame, or of the world if this body does not move."""
+        """Return a lower bound of the distance of bodies i and j, piece by piece [m].
+
+        The pieces are compared along the axes of the first body's frame; of the world if this body
+        is fixed.
+        """
         first, second = self.screen.bodies[i], self.screen.bodies[j]
         stands = first.extent is not None
         axes = self._world if stands else self._own_axes(first.frame)
@@ -323,8 +351,12 @@ class DistanceBounds:
         )
 
     def _box_bound(self, link: int) -> ca.SX:
-        """Return a lower bound of the distance between a link's chain of spheres and the payload's
-        bounding box."""
+        """Return a lower bound of the distance between a link's spheres and the payload's bounding
+        box [m].
+
+        Args:
+            link: index of the link among the bodies.
+        """
         box = self.screen.payload
         half, (R, p) = ca.SX(number(box.size)), self._placed[BOX]
         if isinstance(box.centre, ca.SX) or box.centre.any():
@@ -341,7 +373,14 @@ class DistanceBounds:
         return self._nearest(squared) - radius - 3**0.5 / 2.0 * self.soft.width
 
     def _obstacle(self, index: int, other: int, k: int) -> ca.SX:
-        """Return a lower bound of the distance between a moving body and piece k of an obstacle."""
+        """Return a lower bound of the distance between a moving body and one piece of an obstacle
+        [m].
+
+        Args:
+            index: index of the moving body.
+            other: index of the obstacle's body.
+            k: index of the piece.
+        """
         body, obstacle = self.screen.bodies[index], self.screen.bodies[other].obstacles[k]
         axes = self._world
         if obstacle.axes is not None:
@@ -357,8 +396,11 @@ class DistanceBounds:
         return self.soft.maximum_below(gaps)
 
     def _round_bound(self, index: int, obstacle: Obstacle) -> ca.SX:
-        """Return a lower bound of the distance between a chain of spheres and a fixed cylinder,
-        capsule or sphere."""
+        """Return a lower bound of the distance between a body's spheres and a fixed round shape
+        [m].
+
+        The shape is a cylinder, capsule or sphere.
+        """
         centres, radius = self._chain(index)
         offset, size = number(obstacle.offset), ca.SX(number(obstacle.cover.size))
         bounds = []
@@ -375,13 +417,15 @@ class DistanceBounds:
 
 
 def _ends(extent: Any, k: int) -> list[Interval]:
-    """Return for each direction both ends of the extent, from rows 2 k and 2 k + 1."""
+    """Return the least and largest coordinate along each of three directions, from rows 2 k and 2 k
+    + 1 of extents.
+    """
     rows = ca.SX(number(extent))
     return [(rows[2 * k, d], rows[2 * k + 1, d]) for d in range(3)]
 
 
 def _gaps(pairs: Sequence[tuple[Interval, Interval]]) -> list[ca.SX]:
-    """Compute both gaps, in either order, between the two intervals of each pair."""
+    """Compute for each pair of intervals both gaps: the first above, and the first below."""
     return [gap for a, b in pairs for gap in (a[0] - b[1], b[0] - a[1])]
 
 
@@ -391,7 +435,12 @@ Interval = tuple[ca.SX, ca.SX]
 
 @dataclass(frozen=True)
 class Axes:
-    """Three orthogonal directions, the rows of A (3, 3)."""
+    """Three orthogonal directions.
+
+    Attributes:
+        key: name of the directions, under which results are cached.
+        A: (3, 3) the directions as rows, in the world.
+    """
 
     key: str
     A: ca.SX
@@ -404,16 +453,17 @@ def motion_function(
     name: str,
     pairs: Iterable[int],
 ) -> ca.Function:
-    """Build the function from two configurations to chord and bend (n_pairs,) [m] of some possible
-    pairs.
+    """Build the function that bounds the relative motion of pairs between two configurations.
 
-    Chord and bend are the sums over both bodies, as the module defines them. For two links of one
-    arm the chord is the length of the path of one link as seen from the other; the bend is zero.
-
-    Inputs: pose_a (6,), q_1_a, q_2_a (n,), then pose_b, q_1_b, q_2_b [m, rad].
+    Inputs: pose_a (6,), q_1_a, q_2_a (n,), then pose_b, q_1_b, q_2_b [m, rad]. Outputs: chord and
+    bend (n_pairs,) [m], the sums over both bodies of the module's D and K. For two links of one arm
+    the chord instead bounds the length of the later link's path as seen from the earlier link, and
+    the bend is zero.
 
     Args:
-        screen: screen of the geometry.
+        geometry: bodies and pairs of the cell.
+        joint_placements: the function `RobotModel.joint_placements` of each robot.
+        screen: numbers of the bodies.
         name: name of the new function.
         pairs: indices among the possible pairs.
     """
@@ -454,7 +504,14 @@ def _body_motion(
     placed_b: dict[Frame, tuple[ca.SX, ca.SX]],
     steps: list[ca.SX],
 ) -> tuple[ca.SX, ca.SX]:
-    """Compute the chord and bend [m] of one body between two configurations."""
+    """Compute the chord and bend [m] of one body between two configurations a and b.
+
+    Args:
+        screen: numbers of the bodies.
+        body: the body.
+        placed_a, placed_b: rotation (3, 3) and position (3,) [m] of every frame in the world.
+        steps: absolute changes of box pose (6,), q_1 and q_2 (n,).
+    """
     if body.reach is None:
         return ca.SX(0), ca.SX(0)
     centre, spans = number(body.reach.centre), number(body.reach.spans)
@@ -470,7 +527,12 @@ def _body_motion(
 
 
 def _between_links(first: ScreenBody, second: ScreenBody, step: ca.SX) -> ca.SX:
-    """Compute the length of the path of the later link as seen from the earlier one [m]."""
+    """Compute an upper bound of the length of a link's path as seen from an earlier link [m].
+
+    Args:
+        first, second: the earlier and the later link of one arm.
+        step: (n,) absolute changes of the arm's joint positions [rad or m].
+    """
     assert second.reach is not None, "the later of two links moves"
     reach = number(second.reach.joints)
     moving = range(first.frame.joint + 1, second.frame.joint + 1)

@@ -54,10 +54,10 @@ _DIRECTIONS = _directions()
 
 
 def slab_cover(body: CollisionBody) -> tuple[Piece, ...]:
-    """Cover a body by boxes, cylinders, spheres and capsules.
+    """Return boxes, cylinders, spheres and capsules that together contain a body.
 
     A simple shape is its own cover. A hull gets its smallest box among a few orientations. Pieces
-    inside another piece are dropped, and pieces that nearly fill a common box are merged.
+    inside a box of the cover are dropped, and pieces that nearly fill a common box are merged.
     """
     return _slab_cover(CacheKey(body.pieces, body.name))
 
@@ -87,7 +87,10 @@ def _chain_cover(seen: CacheKey) -> SphereChain:
 
 
 def close_pairs(geometry: CellGeometry) -> frozenset[tuple[int, int]]:
-    """Return the pairs of one arm whose chains of spheres overlap in many postures."""
+    """Return the pairs of bodies of one arm whose chains of spheres overlap in many postures.
+
+    Each pair consists of the indices of both bodies.
+    """
     bodies, found = geometry.bodies, []
     # Where an arm stands does not matter.
     known = [b.content if b.root is None else digest_of_parts(b.root[1]) for b in bodies]
@@ -120,8 +123,9 @@ def _often_close(seen: CacheKey) -> bool:
 
 @lru_cache(maxsize=4)
 def _steps(seen: CacheKey) -> list[Array]:
-    """Compute for each joint of an arm its frame in the frame of the joint before it (POSTURES, 4,
-    4), at random postures."""
+    """Compute each joint's frame (OVERLAP_POSTURES, 4, 4) in the frame of the joint before it, at
+    random postures.
+    """
     (arm,), found = seen.given, []
     q = np.random.default_rng(0).uniform(arm.lower, arm.upper, (OVERLAP_POSTURES, arm.joints))
     for k, axis in enumerate(arm.axes):
@@ -136,8 +140,12 @@ def _steps(seen: CacheKey) -> list[Array]:
 
 
 def _apart(first: tuple[Piece, ...], second: tuple[Piece, ...], T: Array) -> NDArray[np.bool_]:
-    """Return (n,) True for poses in which a coordinate axis separates two sets of pieces. T (n, 4,
-    4) maps the second set into the frame of the first."""
+    """Return True for each pose (n,) in which a coordinate axis separates two sets of pieces.
+
+    Args:
+        first, second: the sets, each in the frame of its body.
+        T: (n, 4, 4) from the frame of `second` to the frame of `first`.
+    """
     axes = np.concatenate([np.eye(3), -np.eye(3)])
     high = np.max([support(piece, axes) for piece in first], axis=0)
     turned = (-axes @ T[:, :3, :3]).reshape(-1, 3)
@@ -147,7 +155,7 @@ def _apart(first: tuple[Piece, ...], second: tuple[Piece, ...], T: Array) -> NDA
 
 
 def _covered(piece: Piece, cover: list[Piece]) -> bool:
-    """Return True if a piece is in its own cover, or lies inside one box of the cover (exact)."""
+    """Return True if a piece is an element of the cover, or lies inside one box of it; exact."""
     return any(
         other is piece or (isinstance(other.shape, Box) and contains(other, piece))
         for other in cover
@@ -194,8 +202,11 @@ def _outermost(cover: list[Piece]) -> list[Piece]:
 
 
 def _merge_once(cover: list[Piece]) -> list[Piece] | None:
-    """Merge the two pieces whose common box adds the least volume; None if no pair stays within the
-    slack."""
+    """Replace two pieces of a cover by their common box.
+
+    Chosen are the pieces whose box stands out least from them. The result is None if every common
+    box stands out by more than `MERGE_SLACK`.
+    """
     best: tuple[float, int, int, Piece] | None = None
     for i, j in combinations(range(len(cover)), 2):
         pair = (cover[i], cover[j])

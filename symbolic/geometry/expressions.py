@@ -1,8 +1,8 @@
-"""Operations that err to one side, exact or smooth, for bounds of distances; and placements.
+"""Operations that are exact or err to a known side, for bounds of distances; placements of frames.
 
-A lower bound of a distance remains one if every operation in it errs downwards (or upwards where it
-is subtracted). `EXACT` computes the sharpest bound, with kinks. `Softness(width)` replaces each
-kink by a hyperbola of this width, which has derivatives of every order:
+A lower bound of a distance stays a lower bound if every operation in it errs downwards, or upwards
+where its result is subtracted. `EXACT` computes the sharpest bound, with kinks. `Softness(w)`
+replaces each kink by a hyperbola of width w, which has derivatives of every order:
 
   |x|  <=  sqrt(x^2 + w^2)              exceeds |x| by at most w,
   max(a, b)  >=  (a + b + sqrt((a-b)^2 + w^2) - w) / 2    falls short by at most w / 2,
@@ -105,7 +105,7 @@ EXACT = Softness()
 
 
 class BasePose(Protocol):
-    """Pose of an arm's base: rotation (3, 3) and position (3,) [m], arrays or symbols."""
+    """Pose of an arm's base in the world, as arrays or symbols."""
 
     @property
     def rotation(self) -> Any:
@@ -117,8 +117,13 @@ class BasePose(Protocol):
 
 
 def world_placements(base: BasePose, placements: tuple[ca.SX, ca.SX]) -> list[tuple[ca.SX, ca.SX]]:
-    """Compute the rotation and position in the world of each joint frame, from placements in the
-    root."""
+    """Compute the rotation (3, 3) and position (3,) [m] of each joint frame in the world.
+
+    Args:
+        base: pose of the arm's base.
+        placements: rotations (3, 3 n) and positions (3, n) of the n joint frames in the root, side
+            by side [m].
+    """
     rotations, positions = placements
     R, p = ca.SX(number(base.rotation)), ca.SX(number(base.position))
     return [

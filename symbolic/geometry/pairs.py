@@ -56,7 +56,11 @@ FAR = "far_"
 
 @dataclass(frozen=True)
 class ActivePair:
-    """Indices of two bodies whose distance is checked, in this cell or with other parameters."""
+    """Indices of two bodies whose distance is checked, in this cell or with other parameters.
+
+    Attributes:
+        first, second: indices of the bodies in `CellGeometry.bodies`, first < second.
+    """
 
     first: int
     second: int
@@ -64,7 +68,12 @@ class ActivePair:
 
 @dataclass(frozen=True)
 class ExcludedPair:
-    """Indices of two bodies whose distance is not checked, and the reason."""
+    """Indices of two bodies whose distance is not checked, and the reason.
+
+    Attributes:
+        first, second: indices of the bodies in `CellGeometry.bodies`, first < second.
+        reason: the reason in words.
+    """
 
     first: int
     second: int
@@ -78,15 +87,15 @@ class CellGeometry:
     Attributes:
         workcell: description of the cell.
         bodies: all collision bodies.
-        arms: joints of both arms in numbers.
-        active: pairs that are checked, in the order of all clearance vectors.
+        arms: frames, axes and limits of both arms' joints.
+        active: pairs that are checked, in the order of the columns of all clearance arrays.
         excluded: all other pairs, with the reason.
-        possible: pairs that are checked with some values of the cell's parameters, or while the box
-            is not held; the active pairs are among them. They have the order of compiled functions.
-        near: number of possible pairs, from the first, that most cells check. Bounds for the others
-            are computed only if one of those is active: pairs that the grasp holds together, and
-            pairs between the links before an arm's second joint and bodies other than this arm and
-            the payload.
+        possible: the active pairs, and pairs that are checked with other parameters of the cell or
+            while the box is not held; in the order of compiled functions.
+        near: number of possible pairs, from the first, that most cells check. The others are pairs
+            that the grasp holds together, and pairs of a body before an arm's second joint with a
+            body other than this arm and the payload. Their bounds are computed only if one of them
+            is active.
     """
 
     workcell: Workcell
@@ -99,8 +108,10 @@ class CellGeometry:
 
     @cached_property
     def blocks(self) -> Mapping[str, range]:
-        """Ranges of the possible pairs whose bounds are computed together, by the prefix of their
-        functions."""
+        """Ranges of the possible pairs whose bounds one compiled function computes.
+
+        The key is the prefix of the function's name: '' for near pairs, `FAR` for the others.
+        """
         far = range(self.near, len(self.possible))
         return {"": range(self.near)} | ({FAR: far} if far else {})
 
@@ -112,14 +123,18 @@ class CellGeometry:
 
     @cached_property
     def asked(self) -> tuple[str, ...]:
-        """Prefixes of the blocks that have to be evaluated: the first block, and others with active
-        pairs."""
+        """Prefixes of the compiled functions to be evaluated: '', and `FAR` if a pair of it is
+        active.
+        """
         blocks = self.blocks.items()
         return tuple(b for b, pairs in blocks if not b or np.isin(self.columns, pairs).any())
 
     def of_active(self, bounds: Sequence[Array]) -> Array:
-        """Select the bounds of active pairs (n, n_active) from the bounds (n, n_block) of the
-        evaluated blocks."""
+        """Select the bounds (n, n_active) of the active pairs.
+
+        Args:
+            bounds: bounds (n, n_block) of each function named in `asked`, in the same order.
+        """
         sizes = [len(self.blocks[block]) for block in self.asked]
         parts = [each.reshape(len(each), n) for each, n in zip(bounds, sizes, strict=True)]
         whole = parts[0] if len(parts) == 1 else np.hstack(parts)
@@ -139,7 +154,10 @@ class CellGeometry:
         )
 
     def index(self, name: str) -> int:
-        """Return the index of a body.
+        """Return the index of a body in `bodies`.
+
+        Args:
+            name: name of the body.
 
         Raises:
             CollisionModelError: there is no such body.
@@ -151,10 +169,11 @@ class CellGeometry:
 
 
 def pair_tolerance(workcell: Workcell, a: CollisionBody, b: CollisionBody) -> float:
-    """Return the distance up to which two bodies count as colliding [m]: the workcell's tolerance.
+    """Return the distance up to which two bodies count as colliding [m].
 
-    For the payload, the uncertain position of the pads is added if the cell states an uncertainty:
-    arms that keep to their paths carry a displaced box displaced.
+    This is the workcell's tolerance. For the payload the uncertainty of the pads' positions is
+    added, if the cell states one: a box that is displaced in the grasp stays displaced along the
+    path.
     """
     return _tolerance(workcell, "box" in (a.frame.kind, b.frame.kind))
 
@@ -186,8 +205,9 @@ def build_geometry(workcell: Workcell) -> CellGeometry:
 def _sorted_pairs(
     given: CacheKey,
 ) -> tuple[tuple[ActivePair, ...], tuple[ExcludedPair, ...], tuple[ActivePair, ...], int]:
-    """Return the active, the excluded and the possible pairs, and the number of possible pairs that
-    are near."""
+    """Return the active, excluded and possible pairs, and the number of near pairs
+    (`CellGeometry`).
+    """
     workcell, bodies, arms, ignored = given.given
     # Pairs within an arm are sorted as if its root were the world: where it stands does not matter.
     at_roots = tuple(b if b.root is None else replace(b, pieces=b.root[1]) for b in bodies)
@@ -226,8 +246,9 @@ def _sorted_pairs(
 
 @cache
 def _is_own(first: str, first_stands: bool, second: str, second_stands: bool) -> bool:
-    """Return True if both bodies belong to the same arm, or one of them to an arm and the other is
-    the payload, so that the other arm has no influence on their distance.
+    """Return True if only one arm has an influence on the distance of two bodies.
+
+    Both bodies belong to this arm, or one is the payload.
 
     Args:
         first, second: groups of the bodies.
@@ -250,8 +271,13 @@ def _arms_of(body: CollisionBody) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class _PairStatus:
-    """Result for a pair: the reason to exclude it, '' if it is active; whether it is possible; and
-    whether few cells check it."""
+    """Decision about a pair.
+
+    Attributes:
+        reason: the reason to exclude the pair; '' if it is active.
+        possible: whether the pair is among the possible pairs.
+        far: whether few cells check the pair.
+    """
 
     reason: str
     possible: bool
@@ -277,8 +303,9 @@ def _sorted(seen: CacheKey) -> _PairStatus:
 
 
 def _is_far(a: CollisionBody, b: CollisionBody) -> bool:
-    """Return True for a pair that few cells check: a body before an arm's second joint, and a body
-    other than this arm and the payload."""
+    """Return True if one body is before an arm's second joint, and the other is neither of this arm
+    nor the payload.
+    """
     still = any(x.root is not None or (x.frame.joint == 0 and not x.is_tool) for x in (a, b))
     return still and a.group != b.group and "payload" not in (a.group, b.group)
 
@@ -286,11 +313,11 @@ def _is_far(a: CollisionBody, b: CollisionBody) -> bool:
 def tools_in_payload(
     bodies: Sequence[CollisionBody], T_joint_box: Sequence[Array]
 ) -> Iterator[CollisionBody]:
-    """Yield the parts of tools that enter the payload by more than `MOST_ENTERED`.
+    """Yield the tool bodies that enter the held payload by more than `MOST_ENTERED`.
 
     Args:
         bodies: all collision bodies.
-        T_joint_box: (4, 4) per arm, pose of the box in the frame of the arm's last joint.
+        T_joint_box: for each arm the pose (4, 4) of the box in the frame of the arm's last joint.
     """
     payload = next(body for body in bodies if body.frame.kind == "box")
     cores = [shrunk(piece, MOST_ENTERED) for piece in payload.pieces]
@@ -302,10 +329,10 @@ def tools_in_payload(
 
 
 def _check_tools(bodies: tuple[CollisionBody, ...], arms: tuple[ArmGeometry, ArmGeometry]) -> None:
-    """Check that no part of a tool enters the payload that it holds by more than `MOST_ENTERED`.
+    """Check that no tool body enters the held payload by more than `MOST_ENTERED`.
 
     Raises:
-        CollisionModelError: a part enters.
+        CollisionModelError: a tool body enters the payload.
     """
     for body in tools_in_payload(bodies, [arm.T_joint_box for arm in arms]):
         raise CollisionModelError(
@@ -317,8 +344,10 @@ def _check_tools(bodies: tuple[CollisionBody, ...], arms: tuple[ArmGeometry, Arm
 
 
 def _rigid(a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> str:
-    """Return the reason to exclude a pair whose bodies do not move relative to each other, because
-    both are fixed to the same link or held by the grasp; '' for other pairs."""
+    """Return the reason to exclude a pair whose bodies do not move relative to each other.
+
+    Both are fixed to one frame, or the grasp holds them together. The result is '' for other pairs.
+    """
     if a.frame != b.frame and "box" not in (a.frame.kind, b.frame.kind):
         return ""
     for robot in (0, 1):
@@ -336,8 +365,9 @@ def _rigid(a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeome
 
 
 def _neighbours(a: CollisionBody, b: CollisionBody, bodies: tuple[CollisionBody, ...]) -> str:
-    """Return the reason to exclude two links of one arm that have no link with a shape between
-    them; '' for other pairs."""
+    """Return the reason to exclude two neighbouring links of one arm, or an arm's mount and its
+    first link; '' for other pairs.
+    """
     for standing, link in ((a, b), (b, a)):
         if link.frame.robot in (standing.carries or ()) and not link.is_tool:
             before = [
@@ -354,8 +384,10 @@ def _neighbours(a: CollisionBody, b: CollisionBody, bodies: tuple[CollisionBody,
 def _always_touching(
     a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]
 ) -> str:
-    """Return the reason to exclude a pair of an arm's bodies, the held box included, that touches
-    in every sampled posture; '' for other pairs."""
+    """Return the reason to exclude two bodies that touch in every sampled posture of an arm.
+
+    The bodies belong to this arm; one may be the held box. The result is '' for other pairs.
+    """
     own = {body.group for body in (a, b) if body.carries is None}
     for robot in _movers(a, b):
         group = f"robot {robot + 1}"
@@ -380,11 +412,14 @@ def _always_touching(
 def ignored_pairs(
     workcell: Workcell, bodies: Sequence[CollisionBody]
 ) -> Mapping[frozenset[str], str]:
-    """Return the reason of every pair that the workcell file or an SRDF ignores, by the names of
-    both bodies.
+    """Return the reason of every pair that the workcell file or an SRDF ignores.
 
-    The workcell file has precedence over an SRDF. A link without collision shape in an SRDF is
-    skipped.
+    The key is the set of both bodies' names. The workcell file has precedence over an SRDF. A link
+    without collision shape in an SRDF has no effect.
+
+    Args:
+        workcell: the workcell.
+        bodies: all collision bodies.
 
     Raises:
         CollisionModelError: a name or pattern of `collision.ignored` matches no body.
@@ -423,7 +458,13 @@ def ignored_pairs(
 
 
 def anchor(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry], robot: int) -> CollisionBody:
-    """Return a body; the held box as a part of the last link of arm `robot`."""
+    """Return the body, or, for the held box, a copy that is fixed to the last link of one arm.
+
+    Args:
+        body: the body.
+        arms: joints of both arms.
+        robot: index of the arm that holds the box.
+    """
     if body.frame.kind != "box":
         return body
     known = body.content, arms[robot].content, robot
@@ -438,8 +479,10 @@ def _anchored(seen: CacheKey) -> CollisionBody:
 
 
 def _movers(a: CollisionBody, b: CollisionBody) -> tuple[int, ...]:
-    """Return the indices of the arms that may move one body relative to the other. Both arms may
-    hold the payload."""
+    """Return the indices of the arms that may move one body relative to the other.
+
+    For the payload these are both arms.
+    """
     if "box" in (a.frame.kind, b.frame.kind):
         return (0, 1)
     return tuple(robot for robot in (0, 1) if robot in (a.frame.robot, b.frame.robot))
@@ -448,7 +491,9 @@ def _movers(a: CollisionBody, b: CollisionBody) -> tuple[int, ...]:
 def _ordered(
     a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry], robot: int
 ) -> tuple[CollisionBody, CollisionBody]:
-    """Return both bodies as `anchor` represents them, sorted by the index of their joint."""
+    """Return both bodies, sorted by the index of their joint; a held box is fixed to arm `robot`
+    (`anchor`).
+    """
     left, right = anchor(a, arms, robot), anchor(b, arms, robot)
     return (left, right) if left.frame.joint <= right.frame.joint else (right, left)
 
@@ -459,8 +504,16 @@ def out_of_reach(
     arms: tuple[ArmGeometry, ArmGeometry],
     tolerance: float,
 ) -> str:
-    """Return the reason to exclude a pair that never meets because a bound of the relative motion
-    keeps both bodies apart by more than `tolerance` [m]; '' for other pairs."""
+    """Return the reason to exclude two bodies that no joint positions bring together.
+
+    Each moving body is enclosed in the zone that it can reach. If the gap of the zones exceeds the
+    tolerance, the pair is excluded. The result is '' for other pairs.
+
+    Args:
+        a, b: the bodies.
+        arms: joints of both arms.
+        tolerance: distance up to which the bodies count as colliding [m].
+    """
     margin = tolerance + 1e-3
     if {a.frame.robot, b.frame.robot} == {0, 1}:
         zones = [_zone(body, arms[body.frame.robot], -1) for body in (a, b)]
@@ -477,14 +530,14 @@ def out_of_reach(
 
 
 def _gap(zone: Piece, pieces: tuple[Piece, ...]) -> float:
-    """Compute the distance of a zone from pieces [m], at most 0 if they meet."""
+    """Compute the distance [m] between a zone and pieces in one frame; at most 0 if they meet."""
     if isinstance(zone.shape, Sphere):
         return min(_from_point(p, zone.centre) for p in pieces) - zone.shape.radius
     return coal_distance((zone,), pieces)
 
 
 def _from_point(piece: Piece, point: Array) -> float:
-    """Compute the distance of a point from a piece [m], at most 0 inside."""
+    """Compute the distance [m] of a point (3,) from a piece in one frame; at most 0 inside."""
     x, y, z = ((point - piece.centre) @ piece.rotation).tolist()
     shape = piece.shape
     match shape:
@@ -509,12 +562,17 @@ def never_meet(
     arms: tuple[ArmGeometry, ArmGeometry],
     tolerance: float,
 ) -> str:
-    """Return the reason to exclude two bodies with two joints between them that collide at no
-    position of these joints; '' for other pairs.
+    """Return the reason to exclude two bodies that collide at no position of the two joints between
+    them; '' for other pairs.
 
     The farther body is replaced by the cylinder that it sweeps about the second joint's axis. The
-    range of the first joint is cut into intervals, each proven free by the distance at its middle,
-    which exceeds the motion of the body within half the interval.
+    range of the first joint is cut into intervals. An interval is free if the distance at its
+    middle exceeds the motion of the cylinder within half the interval by more than the tolerance.
+
+    Args:
+        a, b: the bodies.
+        arms: joints of both arms.
+        tolerance: distance up to which the bodies count as colliding [m].
     """
     for robot in _movers(a, b):
         arm, (low, high) = arms[robot], _ordered(a, b, arms, robot)
@@ -549,11 +607,16 @@ def never_meet(
 
 
 def _zone(body: CollisionBody, arm: ArmGeometry, below: int) -> Piece:
-    """Return a region that contains a body in all positions of the joints before it, in the frame
-    of joint `below` (-1: world).
+    """Return a region that contains a body at all positions of the joints between it and `below`.
 
-    With one rotating joint between, the region is the cylinder swept about that joint's axis. Else
-    it is the ball about the first joint's origin with the length of the stretched chain as radius.
+    If one turning joint is between them, the region is the cylinder that the body sweeps about the
+    joint's axis. Otherwise it is a ball about the first joint's origin, with the length of the
+    stretched links as radius.
+
+    Args:
+        body: a body of the arm.
+        arm: joints of the arm.
+        below: index of the joint in whose frame the region is returned; -1 for the world.
     """
     return _zone_of(CacheKey(body, arm, below, known=(body.content, arm.content, below)))
 
@@ -577,8 +640,14 @@ def _zone_in_root(seen: CacheKey) -> Piece:
 
 
 def chain_radius(body: CollisionBody, arm: ArmGeometry, first: int) -> float:
-    """Return an upper bound of the distance of the body's points from the origin of an earlier
-    joint with index `first` [m]."""
+    """Return an upper bound of the distance of a link's points from the origin of an earlier joint
+    [m].
+
+    Args:
+        body: a body of the arm.
+        arm: joints of the arm.
+        first: index of the earlier joint.
+    """
     behind = slice(first + 1, body.frame.joint + 1)
     offsets = np.linalg.norm(arm.origins[behind, :3, 3], axis=1) + arm.slides[behind]
     own = max(farthest_from_point(piece, np.zeros(3)) for piece in body.pieces)
@@ -586,8 +655,14 @@ def chain_radius(body: CollisionBody, arm: ArmGeometry, first: int) -> float:
 
 
 def relative_placement(arm: ArmGeometry, below: int, joint: int, q: Array) -> Array:
-    """Return the pose (4, 4) of joint `joint` in the frame of an earlier joint `below` (-1: world)
-    at joint positions q (n,)."""
+    """Return the pose (4, 4) of a joint's frame in the frame of an earlier joint.
+
+    Args:
+        arm: joints of the arm.
+        below: index of the earlier joint; -1 for the world.
+        joint: index of the joint.
+        q: (n,) joint positions [rad or m].
+    """
     T: Array = arm.T_world_root if below < 0 else np.eye(4)
     for k in range(below + 1, joint + 1):
         moved = np.eye(4)
@@ -603,7 +678,7 @@ def relative_placement(arm: ArmGeometry, below: int, joint: int, q: Array) -> Ar
 
 
 def coal_geometry(piece: Piece) -> tuple[coal.CollisionGeometry, coal.Transform3s]:
-    """Convert a piece to a Coal shape at its pose in the body's frame."""
+    """Convert a piece to a shape of Coal and its pose in the body's frame."""
     pose = coal.Transform3s(piece.rotation, piece.centre)
     shape = piece.shape
     match shape:
@@ -627,8 +702,9 @@ def _convex(hull: Hull) -> coal.CollisionGeometry:
 
 
 def coal_distance(first: tuple[Piece, ...], second: tuple[Piece, ...]) -> float:
-    """Compute the least distance between two sets of pieces in one frame; negative if they
-    overlap."""
+    """Compute the least distance [m] between two sets of pieces in one frame; negative if they
+    overlap.
+    """
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     left, right = [coal_geometry(p) for p in first], [coal_geometry(p) for p in second]
     distances = []

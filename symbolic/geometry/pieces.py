@@ -1,8 +1,8 @@
-"""Convex pieces: exact support functions, and simple pieces that enclose others, with proof.
+"""Convex pieces of bodies, their support functions, and simple shapes that provably enclose them.
 
-A piece is a convex shape at a pose in its body's frame. Everything that collision checking
-proves (lower bounds of distances, reach, motion between samples) rests on the functions of
-this file, which are exact or err to the safe side; each says which. Lengths in m.
+A piece is a convex shape at a pose in its body's frame. All proofs of collision checking (lower
+bounds of distances, upper bounds of motions) rest on the functions of this file. Each function
+states whether it is exact or a bound. Lengths are in m.
 """
 
 from __future__ import annotations
@@ -23,7 +23,12 @@ from symbolic.records.quantities import SMALLEST_SIZE
 
 @dataclass(frozen=True, eq=False)
 class Hull:
-    """The convex hull of vertices: (n, 3) [m]; faces: (m, 3) triangles, outward."""
+    """A convex hull.
+
+    Attributes:
+        vertices: (n, 3) corners [m].
+        faces: (m, 3) indices of the corners of each triangle, oriented outwards.
+    """
 
     vertices: Array
     faces: NDArray[np.int64]
@@ -31,13 +36,13 @@ class Hull:
 
 @dataclass(frozen=True)
 class CutMesh:
-    """A mesh and its convex pieces.
+    """A mesh that was decomposed into convex hulls.
 
     Attributes:
-        hulls: their union contains it.
-        faces, vertices, parts: numbers of its triangles, of their corners and of its connected
-            components.
-        open_parts: number of the components with holes, each of which is covered by one hull.
+        hulls: convex hulls whose union contains the mesh.
+        faces, vertices: numbers of the mesh's triangles and vertices.
+        parts: number of the mesh's connected components.
+        open_parts: number of components with holes; one hull covers each of them.
     """
 
     hulls: tuple[Hull, ...]
@@ -52,7 +57,12 @@ ConvexShape = Box | Cylinder | Sphere | Capsule | Hull
 
 @dataclass(frozen=True)
 class Piece:
-    """A convex shape at pose (4, 4) in its body's frame."""
+    """A convex shape at a pose in its body's frame.
+
+    Attributes:
+        shape: the shape.
+        pose: (4, 4) from the shape's frame to the body's frame.
+    """
 
     shape: ConvexShape
     pose: Array
@@ -64,7 +74,7 @@ class Piece:
 
     @cached_property
     def centre(self) -> Array:
-        """(3,) origin of the shape's frame in the body's frame."""
+        """(3,) origin of the shape's frame in the body's frame [m]."""
         return self.pose[:3, 3]
 
     @cached_property
@@ -73,12 +83,24 @@ class Piece:
         return self.pose[:3, :3]
 
     def moved(self, T: Array) -> Piece:
-        """Return the piece in the frame into which T (4, 4) maps the body's frame."""
+        """Return the piece in another frame.
+
+        Args:
+            T: (4, 4) from the body's frame to the other frame.
+        """
         return Piece(self.shape, T @ self.pose)
 
 
 def check_piece(piece: Piece, owner: str) -> None:
-    """Raise CollisionModelError unless the shape has a finite, positive size and pose."""
+    """Check that a piece has a finite size, at least `SMALLEST_SIZE`, and a valid pose.
+
+    Args:
+        piece: the piece.
+        owner: name of its body, for messages.
+
+    Raises:
+        CollisionModelError: the size or pose is not valid.
+    """
     shape = piece.shape
     match shape:
         case Box():
@@ -110,15 +132,29 @@ def check_piece(piece: Piece, owner: str) -> None:
 
 
 def support(piece: Piece, directions: Array) -> Array:
-    """Compute the largest u.x over the piece, exact, for each row u of directions (n, 3);
-    returns (n,)."""
+    """Compute the support function of a piece, max u.x over its points x [m]; exact.
+
+    Args:
+        piece: the piece.
+        directions: (n, 3) directions u in the body's frame.
+
+    Returns:
+        (n,) one value per direction.
+    """
     u = np.atleast_2d(directions)
     return np.asarray(u @ piece.centre + reach(piece.shape, u @ piece.rotation), dtype=float)
 
 
 def reach(shape: ConvexShape, directions: Array) -> Array:
-    """Compute the largest u.x over a shape in its own frame, exact, per row u of (n, 3); returns
-    (n,)."""
+    """Compute the support function of a shape, max u.x over its points x [m]; exact.
+
+    Args:
+        shape: the shape.
+        directions: (n, 3) directions u in the shape's own frame.
+
+    Returns:
+        (n,) one value per direction.
+    """
     u = directions
     match shape:
         case Box():
@@ -137,8 +173,14 @@ def reach(shape: ConvexShape, directions: Array) -> Array:
 
 
 def shrunk(piece: Piece, by: float) -> Piece:
-    """Shrink a piece by a length on every side, a hull by at least that; a thin piece keeps a
-    minimum size."""
+    """Return a piece made smaller by a length on every side, but not below a minimum size.
+
+    The faces of a hull move inwards by at least this length.
+
+    Args:
+        piece: the piece.
+        by: the length [m].
+    """
     shape = piece.shape
     left = SMALLEST_SIZE
     match shape:
@@ -165,16 +207,15 @@ def shrunk(piece: Piece, by: float) -> Piece:
 
 
 def box_corners(size: Array) -> Array:
-    """Return the corners (8, 3) of a cuboid of the given edge lengths, centred at its frame."""
+    """Return the corners (8, 3) of a box about the origin with edge lengths `size` (3,) [m]."""
     return np.array(list(product((-0.5, 0.5), repeat=3))) * np.asarray(size)
 
 
 def skeleton(piece: Piece) -> tuple[Array, float]:
-    """Return points (n, 3) in the body's frame and a radius, whose thickened hull contains the
-    piece.
+    """Return points (n, 3) in the body's frame and a radius [m] that represent a piece.
 
-    Exact for boxes, spheres, capsules and hulls. A cylinder is represented by its two end
-    centres and its radius, which adds the end caps.
+    The points' convex hull, thickened by the radius, contains the piece. It equals the piece except
+    for cylinders, which get caps like a capsule.
     """
     shape = piece.shape
     radius = 0.0
@@ -192,8 +233,9 @@ def skeleton(piece: Piece) -> tuple[Array, float]:
 
 
 def farthest_from_point(piece: Piece, point: Array) -> float:
-    """Compute the largest distance of the piece's points from a point of the body's frame,
-    exact."""
+    """Compute the largest distance [m] of a piece's points from a point (3,) in the body's frame;
+    exact.
+    """
     if isinstance(piece.shape, Cylinder):
         local = np.abs(piece.rotation.T @ (np.asarray(point) - piece.centre))
         radial = np.hypot(local[0], local[1]) + piece.shape.radius
@@ -203,7 +245,13 @@ def farthest_from_point(piece: Piece, point: Array) -> float:
 
 
 def farthest_from_axis(piece: Piece, point: Array, axis: Array) -> float:
-    """Bound the distance of the piece's points from a line (point, unit axis)."""
+    """Compute an upper bound of the distance of a piece's points from a line [m].
+
+    Args:
+        piece: the piece.
+        point: (3,) a point of the line in the body's frame [m].
+        axis: (3,) unit vector along the line.
+    """
     points, radius = skeleton(piece)
     arms = points - point
     across = arms - np.outer(arms @ axis, axis)
@@ -211,8 +259,12 @@ def farthest_from_axis(piece: Piece, point: Array, axis: Array) -> float:
 
 
 def bounding_box(pieces: tuple[Piece, ...], rotation: Array) -> Piece:
-    """Compute the smallest box with the given axes (3, 3, columns) that contains all pieces,
-    exact."""
+    """Compute the smallest box with given axes that contains all pieces; exact.
+
+    Args:
+        pieces: pieces in one frame.
+        rotation: (3, 3) axes of the box in this frame, as columns.
+    """
     axes = np.asarray(rotation).T
     upper = np.max([support(piece, axes) for piece in pieces], axis=0)
     lower = -np.max([support(piece, -axes) for piece in pieces], axis=0)
@@ -220,8 +272,9 @@ def bounding_box(pieces: tuple[Piece, ...], rotation: Array) -> Piece:
 
 
 def edges(pieces: tuple[Piece, ...]) -> Array:
-    """Compute the edge lengths (3,), ascending, of the pieces' bounding box along the frame's
-    axes [m]."""
+    """Compute the edge lengths (3,) of the pieces' bounding box along the frame's axes, ascending
+    [m].
+    """
     box = bounding_box(pieces, np.eye(3))
     assert isinstance(box.shape, Box)
     return np.asarray(np.sort(box.shape.size))
@@ -231,8 +284,16 @@ def edges(pieces: tuple[Piece, ...]) -> Array:
 
 
 def contains(cover: Piece, piece: Piece, tolerance: float = 1e-12) -> bool:
-    """Return True if a box or sphere contains a piece, exact up to the tolerance [m] for
-    roundoff."""
+    """Return True if a box or sphere contains a piece; exact.
+
+    Args:
+        cover: the box or sphere.
+        piece: the piece, in the same frame.
+        tolerance: allowance for roundoff [m].
+
+    Raises:
+        CollisionModelError: the cover is neither a box nor a sphere.
+    """
     match cover.shape:
         case Box():
             axes = cover.rotation.T
@@ -253,17 +314,16 @@ def contains(cover: Piece, piece: Piece, tolerance: float = 1e-12) -> bool:
 
 @dataclass(frozen=True)
 class SphereChain:
-    """Equal spheres along the longest side of a bounding box.
+    """Equal spheres in a row that contain the pieces of a body.
 
-    The box contains the pieces and is cut into equal slabs across its longest side; each sphere
-    passes through the corners of its slab. So every point of the pieces lies in a slab, and
-    every slab in a sphere: that is the proof of containment, which the constructor
-    `sphere_chain` checks with exact functions.
+    The bounding box of the pieces is cut into equal slabs across its longest side. Each sphere
+    passes through the corners of one slab, so it contains the slab. `sphere_chain` checks that the
+    box contains the pieces and each sphere its slab.
 
     Attributes:
-        centres: (n, 3) in the body's frame [m].
-        radius: of every sphere [m].
-        slabs: the boxes between the bounding box and the spheres.
+        centres: (n, 3) centres of the spheres in the body's frame [m].
+        radius: radius of every sphere [m].
+        slabs: the n slabs of the bounding box.
     """
 
     centres: Array
@@ -272,14 +332,15 @@ class SphereChain:
 
 
 def sphere_chain(pieces: tuple[Piece, ...], rotation: Array, slenderness: float) -> SphereChain:
-    """Cover pieces by a chain of equal spheres.
+    """Cover pieces by a chain of equal spheres along the longest side of their bounding box.
 
     Args:
-        rotation: (3, 3) axes of the bounding box.
-        slenderness: slabs are about this many times as long as the box is wide.
+        pieces: pieces in one frame.
+        rotation: (3, 3) axes of the bounding box in this frame, as columns.
+        slenderness: approximate length of a slab over the width of the box.
 
     Raises:
-        CollisionModelError: a slab is not inside its sphere or a piece not inside the box.
+        CollisionModelError: a slab is not inside its sphere, or a piece not inside the box.
     """
     box = bounding_box(pieces, rotation)
     assert isinstance(box.shape, Box)
@@ -308,15 +369,20 @@ def sphere_chain(pieces: tuple[Piece, ...], rotation: Array, slenderness: float)
 
 
 def ball(centre: Array, radius: float) -> Piece:
-    """Return a sphere piece."""
+    """Return a sphere as a piece, with its centre (3,) and radius [m] in the body's frame."""
     return Piece(Sphere(radius), transform(np.eye(3), centre))
 
 
 def swept_cylinder(pieces: tuple[Piece, ...], point: Array, axis: Array) -> Piece:
-    """Compute a cylinder about a line (point, unit axis) that contains the pieces in every
-    rotation.
+    """Compute a cylinder about a line that contains the pieces at every rotation about the line.
 
-    The pieces' extent along the axis is exact; the radius errs to the safe side for cylinders.
+    The length of the cylinder is exact. The radius is exact too, except for cylinders among the
+    pieces, for which it is an upper bound.
+
+    Args:
+        pieces: pieces in one frame.
+        point: (3,) a point of the line [m].
+        axis: (3,) unit vector along the line.
     """
     radius = max(farthest_from_axis(piece, point, axis) for piece in pieces)
     upper = max(float(support(piece, axis)[0]) for piece in pieces)

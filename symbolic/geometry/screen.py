@@ -305,7 +305,9 @@ def _obstacle(piece: Piece) -> Obstacle:
 
 
 def _extent(piece: Piece, A: Array) -> Array:
-    """Compute the least and largest coordinates (2, 3) [m] of a piece along the rows of A (3, 3)."""
+    """Compute the least and largest coordinate of a piece along each row of A (3, 3): (2,
+    3) [m].
+    """
     return np.stack([-support(piece, -A), support(piece, A)])
 
 

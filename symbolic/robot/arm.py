@@ -1,11 +1,11 @@
-"""One arm that follows the box: inverse kinematics along the samples, limits and joint torques.
+"""Inverse kinematics of an arm along the samples of a box path, joint limits and joint torques.
 
-Paper Eqs. 29-33 and 61-62. The flange's target follows from the box pose alone, so both arms keep
-the relative grasp exactly. The extended pose sets an arm's redundant joints (`RobotModel`); the
-other six follow. Newton's method is warm started by quadratic extrapolation of the previous
-samples, and its residual is measured. Two cheap steps suffice nearly everywhere. A third follows if
-the second started too far away. If that is not enough, `IK_NEWTON_STEPS` steps by QR factors
-decide: a sample counts as lost only if they do not reach it either.
+Paper Eqs. 29-33 and 61-62. The pose of the box alone determines the target of each flange, so both
+arms keep their grasps exactly. The extended pose sets an arm's redundant joints (`RobotModel`); the
+other six joints follow the box. Newton's method starts from the quadratic extrapolation of the
+previous samples. Two cheap steps suffice nearly everywhere. A third step follows if the residual
+before the second step was large. If the residual is still too large, `IK_NEWTON_STEPS` steps by QR
+factors are made. A sample that these do not reach either is lost.
 """
 
 from __future__ import annotations
@@ -69,11 +69,14 @@ torque that exerts the contact wrench [N m, or N for a sliding joint].
 def flange_target(
     robot: Robot, contact: Contact, position: ca.SX, rotation: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """Compute the flange's target rotation (3, 3) and position (3,) in the robot's root frame.
+    """Compute the rotation (3, 3) and position (3,) that the flange has to reach, in the robot's
+    root frame [m].
 
     Args:
-        position, rotation: position (3,) [m] and rotation (3, 3) of the box in the world
-            (paper Eqs. 30-33).
+        robot: the arm.
+        contact: the arm's contact with the box.
+        position, rotation: position (3,) [m] and rotation (3, 3) of the box in the world (paper
+            Eqs. 30-33).
     """
     T_box_flange = box_flange(robot, contact)
     R_root_world = number(robot.T_world_base[:3, :3].T)
@@ -86,8 +89,12 @@ def flange_target(
 
 
 def limit_margin(robot: Robot, q: ca.SX) -> ca.SX:
-    """Compute the least distance (scalar) of the joints to their limits, negative beyond one
-    [rad]."""
+    """Compute the least distance of any joint to its limits [rad], negative beyond a limit.
+
+    Args:
+        robot: the arm.
+        q: (n,) joint positions [rad, or m for a sliding joint].
+    """
     lower, upper = number(robot.position_lower), number(robot.position_upper)
     return ca.mmin(ca.vertcat(q - lower, upper - q))
 
@@ -98,10 +105,11 @@ def joint_torque(
     """Compute the joint torques (n,) that exert a contact wrench on the box (paper Eq. 45) [N m].
 
     Args:
+        robot: the arm.
+        contact: the arm's contact with the box.
         jacobian: Jacobian (6, n) of the flange in the robot's root frame, linear rows first.
         rotation: rotation R_world_box (3, 3) of the box.
-        wrench: contact wrench (6,) on the box about the nominal contact point, world axes
-            [N, N m].
+        wrench: contact wrench (6,) on the box about the nominal contact point, world axes [N, N m].
     """
     lever = ca.mtimes(rotation, number(flange_lever(robot, contact)))
     moment = wrench[3:] + ca.cross(lever, wrench[:3])
@@ -111,11 +119,12 @@ def joint_torque(
 
 
 def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str) -> ca.Function:
-    """Build the function of one sample of an arm's motion, which is applied to the samples in turn.
+    """Build the function that moves an arm to the next sample of a box path.
 
-    Inputs: state (3 n + 1,), the joints at the previous sample, their first and second difference,
-    and `lost`; the extended pose; wrench (6,) on the box about the nominal contact point. Outputs:
-    the next state, then `TRACK_OUTPUTS`.
+    Inputs: state (3 n + 1,), which holds the joints at the previous sample, their first and second
+    difference between samples, and `lost`; pose (6 + m,), the extended pose of the sample; wrench
+    (6,) on the box about the nominal contact point, world axes [N, N m]. Outputs: next_state, then
+    `TRACK_OUTPUTS`.
     """
     n = model.n_joints
     state, pose = ca.MX.sym("state", 3 * n + 1), ca.MX.sym("pose", model.pose_size)
@@ -154,8 +163,11 @@ def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
 
 
 def torque_function(robot: Robot, model: RobotModel, contact: Contact, name: str) -> ca.Function:
-    """Build the function from joints (n,), extended pose and wrench (6,) on the box to joint_torque
-    (n,) [N m]."""
+    """Build the function of the joint torques (n,) that exert a contact wrench [N m].
+
+    Inputs: joints (n,) [rad or m], extended pose (6 + m,), and wrench (6,) on the box about the
+    nominal contact point, world axes [N, N m].
+    """
     q, pose = ca.SX.sym("q", model.n_joints), ca.SX.sym("pose", model.pose_size)
     wrench = ca.SX.sym("wrench", 6)
     rotation = rotation_matrix(model.orientation, pose[3:6])
@@ -215,7 +227,9 @@ def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str,
 
 
 def _placed(model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX) -> list[ca.SX]:
-    """Return the joints q (n,), their pose residual [m, rad] and the flange's Jacobian (6, n)."""
+    """Return the joints q (n,), their pose residual from the target [m, rad] and the flange's
+    Jacobian (6, n).
+    """
     R, p, jacobian = model.kinematics(q)
     return [q, pose_error(R_target, p_target, R, p)[1], jacobian]
 
@@ -240,11 +254,11 @@ def follow_function(
     """Build the function of an arm's motion along all samples of a box path.
 
     Inputs: start (n,), joints at the first box pose [rad]; pose (6 + m, samples), the extended
-    poses; wrench (6, samples) on the box about the nominal contact point. Outputs: `TRACK_OUTPUTS`
-    of all samples.
+    poses; wrench (6, samples) on the box about the nominal contact point [N, N m]. Outputs:
+    `TRACK_OUTPUTS` of all samples, one column per sample.
 
-    For the second sample there is no earlier motion to extrapolate. Newton steps from the start
-    posture predict it instead.
+    The second sample has no earlier motion to extrapolate, so Newton steps from the start posture
+    predict its joints.
     """
     start, pose = ca.MX.sym("start", model.n_joints), ca.MX.sym("pose", model.pose_size, samples)
     wrench, given = ca.MX.sym("wrench", 6, samples), mx_parameters(robot)
@@ -268,11 +282,12 @@ def follow_function(
 
 
 def start_function(robot: Robot, model: RobotModel, contact: Contact, name: str) -> ca.Function:
-    """Build the function of the state of `track_function` before the first sample.
+    """Build the function of an arm's state before the first sample, the input of `track_function`.
 
-    Inputs: start (n,), joints at the first box pose; extended, the first extended pose. The
-    redundant joints move evenly from their start positions to those of the extended pose, in
-    `BEGIN_STEPS` Newton steps that keep the flange at the box.
+    Inputs: start (n,), joints that hold the box at its first pose; pose (6 + m,), the first
+    extended pose. The redundant joints move evenly from their start positions to their values in
+    the extended pose, in `BEGIN_STEPS` Newton steps that keep the flange at the box. Output: state
+    (3 n + 1,) without motion.
     """
     n = model.n_joints
     start, pose = ca.MX.sym("start", n), ca.MX.sym("pose", model.pose_size)
@@ -297,10 +312,11 @@ def start_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
 def prediction_function(
     robot: Robot, model: RobotModel, contact: Contact, name: str
 ) -> ca.Function:
-    """Build the function that predicts the second sample: the state of `track_function` after the
-    first sample, with the change of the joints found by Newton steps.
+    """Build the function that predicts an arm's motion from the first sample to the second.
 
-    Inputs: state (3 n + 1,); the extended pose of the second sample.
+    Inputs: state (3 n + 1,) of `track_function` after the first sample; pose (6 + m,), the extended
+    pose of the second sample. Output: the state with the joints' first difference that Newton steps
+    find.
     """
     n = model.n_joints
     state, pose = ca.SX.sym("state", 3 * n + 1), ca.SX.sym("pose", model.pose_size)
@@ -319,9 +335,9 @@ def prediction_function(
 def posture_function(robots: Arms, models: Models, contacts: Contacts) -> ca.Function:
     """Build the function of both arms' postures at one box pose, from nearby joint positions.
 
-    Inputs: pose (6,) of the box; guess_1, guess_2 (n,) nearby joints [rad]. Outputs: q_1, q_2 (n,)
-    after `IK_NEWTON_STEPS`, with the redundant joints of the guess; residual_1, residual_2, their
-    pose residuals [m, rad].
+    Inputs: pose (6,) of the box [m, rad]; guess_1, guess_2 (n,), nearby joint positions [rad]. The
+    guess sets the redundant joints. Outputs: q_1, q_2 (n,) after `IK_NEWTON_STEPS` [rad];
+    residual_1, residual_2, the pose residuals of q_1 and q_2 [m, rad].
     """
     pose = ca.SX.sym("pose", 6)
     guesses = [ca.SX.sym(f"guess_{i + 1}", model.n_joints) for i, model in enumerate(models)]
@@ -352,11 +368,16 @@ _POSTURES = 200
 
 
 def pose_error(R_target: ca.SX, p_target: ca.SX, R: ca.SX, p: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Compute Newton's right-hand side (6,) and the pose residual (scalar) of a placement.
+    """Compute the error of a flange placement: Newton's right-hand side (6,), and the scalar
+    residual.
 
-    The right-hand side holds the position error and the axis of the rotation error times the
-    sine of its angle. The residual uses twice the sine of the half angle instead, which is zero
+    The right-hand side holds the position error [m], then the axis of the rotation error times the
+    sine of its angle. The residual contains twice the sine of the half angle instead, which is zero
     for equal rotations only.
+
+    Args:
+        R_target, p_target: wanted rotation (3, 3) and position (3,) [m] of the flange.
+        R, p: actual rotation (3, 3) and position (3,) [m] in the same frame.
     """
     dR = ca.mtimes(R_target, R.T)
     axis = ca.vertcat(dR[2, 1] - dR[1, 2], dR[0, 2] - dR[2, 0], dR[1, 0] - dR[0, 1]) / 2.0
@@ -366,7 +387,13 @@ def pose_error(R_target: ca.SX, p_target: ca.SX, R: ca.SX, p: ca.SX) -> tuple[ca
 
 
 def newton_step(model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX) -> ca.SX:
-    """Return the joints (n,) after one safeguarded Newton step of the inverse kinematics."""
+    """Return the joints (n,) after one Newton step of the inverse kinematics, limited in length.
+
+    Args:
+        model: model of the arm.
+        q: (n,) joint positions before the step [rad or m].
+        R_target, p_target: wanted rotation (3, 3) and position (3,) [m] of the flange in the root.
+    """
     R, p = model.placement(q)
     error, _ = pose_error(R_target, p_target, R, p)
     Q, upper = ca.qr(following_columns(model, model.jacobian(q)))
@@ -377,12 +404,18 @@ def newton_step(model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX) -
 def block_step(
     model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """Return the joints (n,) after a Newton step of the six joints with few operations, and the
-    pose residual before the step.
+    """Return the joints (n,) after a Newton step with few operations, and the pose residual before
+    it.
 
-    The angular rows give three joints in terms of the others by Cramer's rule, and the rest is
-    again a 3 by 3 system. There is no pivoting: the step fails where the three axes nearly lie in a
-    plane, and the next residual shows this.
+    The step solves two 3 by 3 systems by Cramer's rule: the angular rows of the Jacobian give three
+    joints in terms of the other three, which follow from the linear rows. Without pivoting the step
+    fails where the axes of the first three joints nearly lie in a plane; the next residual is then
+    large.
+
+    Args:
+        model: model of the arm.
+        q: (n,) joint positions before the step [rad or m].
+        R_target, p_target: wanted rotation (3, 3) and position (3,) [m] of the flange in the root.
     """
     R, p, whole = model.kinematics(q)
     jacobian = following_columns(model, whole)
@@ -414,8 +447,9 @@ def _cramer(A: ca.SX) -> Callable[[ca.SX], ca.SX]:
 
 @lru_cache(maxsize=8)
 def _independent_axes(model: RobotModel) -> tuple[int, ...]:
-    """Return the indices of those three of the six joints whose axes stay farthest from a common
-    plane in random postures."""
+    """Return the indices of three joints among the six that follow the box, such that their axes
+    stay farthest from a common plane in random postures.
+    """
     lower, upper = model.model.lowerPositionLimit, model.model.upperPositionLimit
     postures = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, len(lower)))
     jacobians = np.array(model.jacobian.map(_POSTURES)(postures.T)).reshape(6, _POSTURES, -1)
@@ -433,8 +467,11 @@ def following_columns(model: RobotModel, jacobian: ca.SX) -> ca.SX:
 
 
 def _limited(model: RobotModel, q: ca.SX, step: ca.SX) -> ca.SX:
-    """Return the joints q after a step of the six joints, shortened such that no joint moves more
-    than `MAX_JOINT_STEP`."""
+    """Return the joints (n,) after a step of the six joints that follow the box.
+
+    The step is shortened such that no joint moves more than `MAX_JOINT_STEP`, and left out if it is
+    not finite.
+    """
     largest = ca.norm_inf(step)
     # At a singular posture the step is not a number: stay, and let the residual tell.
     usable = ca.norm_1(step) < 1e9
@@ -446,9 +483,10 @@ def _limited(model: RobotModel, q: ca.SX, step: ca.SX) -> ca.SX:
 
 
 def manipulability(jacobian: ca.SX) -> ca.SX:
-    """Compute |det J| [m^3] of a (6, 6) Jacobian (Yoshikawa's manipulability of six joints).
+    """Compute abs(det(J)) [m^3] of a Jacobian J (6, 6), Yoshikawa's manipulability of six joints.
 
-    By Laplace's expansion in minors of three rows: no division, so exact at singular postures.
+    The determinant is expanded in minors of three rows (Laplace). Without division it is exact at
+    singular postures too.
     """
     upper, lower = _minors(jacobian[:3, :]), _minors(jacobian[3:, :])
     signed = [

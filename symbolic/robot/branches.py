@@ -1,9 +1,9 @@
 """All inverse-kinematics branches of an arm at a pose, and the ranking of start branches.
 
-Six joints reach a pose in up to sixteen ways; an arm's redundant joints have the values of the
-hand-made trajectory at the start. No closed form covers every arm (the GoFa's wrist is offset). So
-Newton's method runs from a low-discrepancy set of starts over the whole joint range, all at once,
-and the distinct solutions are collected. The residual of each is checked.
+Six joints reach a pose in up to sixteen ways. At the start an arm's redundant joints have their
+values in the hand-made trajectory. No closed form covers every arm (the GoFa's wrist is offset). So
+Newton's method starts from many postures that fill the joint ranges evenly, all at once, and the
+distinct solutions are collected. The residual of each solution is checked.
 """
 
 from __future__ import annotations
@@ -71,10 +71,11 @@ class StartBranch:
 
     @property
     def rank(self) -> tuple[float, ...]:
-        """Sort key, smaller is better: number of samples kept, then clearance, then margins.
+        """Sort key, smaller is better: samples kept, then clearance, then margin times
+        manipulability.
 
-        Clearance beyond `ROBUST_CLEARANCE` does not count. The last entry is the distance to the
-        nearest limit times the manipulability, since both should be large.
+        Clearance beyond `ROBUST_CLEARANCE` does not count. The margin is the distance to the
+        nearest joint limit.
         """
         robust = min(self.clearance, ROBUST_CLEARANCE)
         return (-float(self.kept), -round(robust, 4), -self.limit_margin * self.manipulability)
@@ -106,8 +107,8 @@ class ArmSearch:
         follow: function of the arm's motion along extended poses (type `Follow`).
         poses: function from waypoints to all samples of the path (type `Poses`).
         clearance: function of the arm's least clearance bound [m]; None for no bound.
-        found: cache of postures (m, n), keyed by the searched flange placement and redundant
-            joints.
+        found: cache of start postures (m, n), keyed by flange placement, joint limits and positions
+            of redundant joints.
     """
 
     approach: Approach
@@ -120,7 +121,14 @@ class ArmSearch:
 def interpreted_search(
     workcell: Workcell, arm: int, model: RobotModel, clearance: Clearance | None = None
 ) -> ArmSearch:
-    """Build the functions of the search for an arm's start branches with CasADi's interpreter."""
+    """Build the functions of the search for an arm's start branches with CasADi's interpreter.
+
+    Args:
+        workcell: the workcell.
+        arm: index of the arm, 0 or 1.
+        model: model of the arm.
+        clearance: function of the arm's least clearance bound [m]; None for no bound.
+    """
     track = follow_function(
         workcell.robots[arm], model, workcell.contacts[arm], workcell.task.samples, "follow"
     )
@@ -141,7 +149,7 @@ def interpreted_search(
 
 
 def interpreted_approach(model: RobotModel) -> Approach:
-    """Build the function of type `Approach` of an arm with CasADi's interpreter."""
+    """Build an arm's function of Newton steps (type `Approach`) with CasADi's interpreter."""
     function = approach_function(model, "approach")
 
     def approach(q: Array, rotation: Array, position: Array) -> Mapping[str, Array]:
@@ -194,19 +202,22 @@ def inverse_kinematics(
     redundant: Mapping[int, float] = MappingProxyType({}),
     approach: Approach | None = None,
 ) -> Array:
-    """Find all joint positions of a flange pose. Positions that differ by full turns of a joint
-    count as one.
+    """Find all joint positions of an arm at a flange pose.
+
+    Positions that differ by full turns of a joint count as one.
 
     Args:
+        robot: the arm, with its joint limits.
+        model: model of the arm.
         T_root_flange: (4, 4) wanted flange placement in the robot's root frame.
         n_starts: number of start postures for Newton's method.
         redundant: positions of the arm's redundant joints by their indices [rad or m].
-        approach: the arm's approach function; None for CasADi's interpreter.
+        approach: the arm's function of Newton steps; None for CasADi's interpreter.
 
     Returns:
-        (m, n) [rad] sorted lexicographically, each with a residual below `SOLUTION_TOLERANCE`. Each
-        joint is on the turn nearest the middle of its range. Postures with a joint beyond its
-        limits on every turn are left out.
+        (m, n) joint positions of m postures [rad], sorted lexicographically, each with a residual
+        below `SOLUTION_TOLERANCE`. Each joint is on the turn nearest the middle of its range.
+        Postures with a joint beyond its limits on every turn are left out.
     """
     approach = approach or interpreted_approach(model)
     following = list(model.following)
@@ -233,14 +244,15 @@ def inverse_kinematics(
 
 
 def _spread(count: int) -> Array:
-    """Return points (count, 6) that fill the unit cube evenly, the same on every machine."""
+    """Return points (count, 6) that fill the unit cube evenly; they are the same in every call."""
     steps = 1.0 / np.cumprod(np.full(6, SPREAD_ROOT))
     return np.asarray((0.5 + np.arange(count)[:, None] * steps) % 1.0)
 
 
 def _distinct(q: Array) -> Array:
-    """Return the rows that differ from all earlier rows by more than `BRANCH_TOLERANCE`, up to full
-    turns."""
+    """Return the rows of q that differ from all earlier rows by more than `BRANCH_TOLERANCE`, up to
+    full turns.
+    """
     kept = []
     while len(q):
         kept.append(q[0])
@@ -250,8 +262,15 @@ def _distinct(q: Array) -> Array:
 
 
 def _central_turns(robot: Robot, model: RobotModel, least: Array, greatest: Array) -> Array:
-    """Compute the full turns [rad] that move each joint range nearest to the middle of the joint's
-    limits; zero for prismatic and redundant joints."""
+    """Compute the full turns (n,) [rad] that bring joint paths nearest to the middle of the limits.
+
+    The entries of prismatic and redundant joints are zero.
+
+    Args:
+        robot: the arm, with its joint limits.
+        model: model of the arm.
+        least, greatest: (n,) or (m, n) least and greatest position of each joint on its path [rad].
+    """
     middle = (robot.position_lower + robot.position_upper) / 2.0
     free = [turns and k in model.following for k, turns in enumerate(model.turning)]
     turns = np.array(free) * np.round((middle - (least + greatest) / 2.0) / (2.0 * np.pi))
@@ -267,7 +286,9 @@ def start_branches(
     turn starts on the turn that keeps it farthest from its limits.
 
     Args:
+        workcell: the workcell.
         arm: index of the arm, 0 or 1.
+        model: model of the arm.
         search: the functions of the search; None for the interpreted functions, without clearance.
     """
     robot, contact = workcell.robots[arm], workcell.contacts[arm]
@@ -314,7 +335,9 @@ def start_branches(
 
 
 def start_flange(workcell: Workcell, robot: Robot, contact: Contact) -> Array:
-    """Compute T_root_flange (4, 4) of an arm that holds the box at the first waypoint."""
+    """Compute the flange pose T_root_flange (4, 4) of an arm that holds the box at the first
+    waypoint.
+    """
     start = workcell.task.waypoints[0].lower
     T_world_box = box_placement(workcell.task.orientation, start)
     return inverse(robot.T_world_base) @ T_world_box @ box_flange(robot, contact)

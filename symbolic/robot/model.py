@@ -74,7 +74,12 @@ class RobotModel:
 
     def with_redundant(self, q: Expression, extended: Expression) -> Expression:
         """Return the joints (n,) with the redundant ones replaced by their values in the extended
-        pose."""
+        pose.
+
+        Args:
+            q: (n,) joint positions [rad or m].
+            extended: (6 + m,) extended pose.
+        """
         columns = dict(self.redundant)
         if not columns:
             return q
@@ -89,13 +94,15 @@ class RobotModel:
 
     @cached_property
     def kinematics(self) -> casadi.Function:
-        """q -> rotation (3, 3), position (3,) [m], jacobian (6, n): `placement` and `jacobian`
-        in one, sharing their common terms."""
+        """Function from q to rotation (3, 3), position (3,) [m] and jacobian (6, n) of the flange.
+
+        The outputs are those of `placement` and `jacobian`, computed with their common terms once.
+        """
         return bridge.frame_kinematics(self.model, self.flange_id)
 
     @cached_property
     def placement(self) -> casadi.Function:
-        """q -> rotation (3, 3) and position (3,) [m] of the flange in the root."""
+        """Function from q to rotation (3, 3) and position (3,) [m] of the flange in the root."""
         q = casadi.SX.sym("q", self.n_joints)
         rotation, position, _ = self.kinematics(q)
         return casadi.Function(
@@ -104,26 +111,38 @@ class RobotModel:
 
     @cached_property
     def jacobian(self) -> casadi.Function:
-        """q -> jacobian (6, n) of the flange: rows 0-2 the linear velocity of its origin, rows 3-5
-        its angular velocity, both along the root's axes."""
+        """Function from q to the Jacobian (6, n) of the flange.
+
+        Rows 0-2 give the linear velocity of the flange's origin, rows 3-5 the angular velocity,
+        both along the root's axes.
+        """
         q = casadi.SX.sym("q", self.n_joints)
         return casadi.Function("jacobian", [q], [self.kinematics(q)[2]], ["q"], ["jacobian"])
 
     @cached_property
     def drift(self) -> casadi.Function:
-        """q, v -> drift (6,): the flange's acceleration at a = 0, rows as in `jacobian`, so that
-        its classical acceleration is jacobian @ a + drift [m/s^2, rad/s^2]."""
+        """Function from q and v to drift (6,), the flange's acceleration if the joint accelerations
+        a are zero.
+
+        The classical acceleration of the flange is jacobian @ a + drift [m/s^2, rad/s^2], with rows
+        as in `jacobian`.
+        """
         return bridge.frame_drift(self.model, self.flange_id)
 
     @cached_property
     def joint_placements(self) -> casadi.Function:
-        """q -> rotations (3, 3 n) and positions (3, n) [m] of the joint frames in the root,
-        side by side in the order of q."""
+        """Function from q to rotations (3, 3 n) and positions (3, n) [m] of the joint frames in the
+        root.
+
+        Columns follow the order of q, three per joint for rotations and one for positions.
+        """
         return bridge.joint_placements(self.model)
 
     @cached_property
     def inverse_dynamics(self) -> casadi.Function:
-        """q, v, a -> torque (n,) [N m, or N] that moves the bare arm, gravity included."""
+        """Function from q, v, a to the joint torques (n,) that move the arm without the box,
+        gravity included [N m or N].
+        """
         return bridge.inverse_dynamics(self.model)
 
 
@@ -137,12 +156,14 @@ def build_robot_model(
 
     Args:
         robot: the arm.
-        redundant, pose_size, orientation: attributes of `RobotModel`; `symbolic.records.Task` has
-            them.
+        redundant: for each redundant joint of the arm, its index in q and its index in the extended
+            pose.
+        pose_size: number of entries of the extended pose.
+        orientation: convention of entries 3 to 5 of the extended pose; None for the default.
 
     Raises:
-        RobotModelError: the URDF cannot be read, or does not describe a serial arm that ends in
-            the flange.
+        RobotModelError: the URDF cannot be read, or does not describe a serial arm that ends in the
+            flange.
     """
     model = arm_model(robot)
     model.gravity.linear = gravity_in_root(robot.T_world_base)
@@ -151,7 +172,10 @@ def build_robot_model(
 
 
 def gravity_in_root(T_world_base: Array) -> Array:
-    """Compute the acceleration of gravity (3,) [m/s^2] along the axes of a base at T_world_base
-    (4, 4)."""
+    """Compute the acceleration of gravity (3,) along the axes of an arm's root [m/s^2].
+
+    Args:
+        T_world_base: (4, 4) pose of the root in the world.
+    """
     gravity: Array = T_world_base[:3, :3].T @ pinocchio.Model.gravity981
     return gravity + 0.0  # no negative zeros: upright arms are alike

@@ -25,37 +25,47 @@ from symbolic.extension import compiled_module, require_same_minor
 
 
 def frame_kinematics(model: pinocchio.Model, frame: int) -> casadi.Function:
-    """Return the placement and Jacobian of a frame of the model.
+    """Build the function from q (nq,) to placement and Jacobian of a frame of the model.
 
-    q (nq,) -> rotation (3, 3) and position (3,) [m] of the frame in the root, and its jacobian
-    (6, nv): rows 0-2 give the linear velocity of the frame's origin, rows 3-5 the angular
+    Outputs: rotation (3, 3) and position (3,) [m] of the frame in the root, and jacobian (6, nv).
+    Rows 0-2 of the Jacobian give the linear velocity of the frame's origin, rows 3-5 the angular
     velocity, both along the root's axes (Pinocchio's LOCAL_WORLD_ALIGNED).
+
+    Args:
+        model: the robot's model.
+        frame: index of the frame among the model's frames.
     """
     return _function(_extension().frame_kinematics(model.saveToString(), frame))
 
 
 def frame_drift(model: pinocchio.Model, frame: int) -> casadi.Function:
-    """Build the function of the part dJ/dt v of a frame's acceleration, which the joint velocities
-    alone cause.
+    """Build the function from q (nq,) and v (nv,) to a frame's acceleration dJ/dt v.
 
-    q (nq,), v (nv,) -> drift (6,): linear [m/s^2] then angular [rad/s^2], along the root's axes.
-    The frame's classical acceleration is jacobian @ a + drift.
+    This is the part (6,) of the acceleration that joint velocities alone cause: linear [m/s^2],
+    then angular [rad/s^2], along the root's axes. The frame's classical acceleration is jacobian @
+    a + drift, with the joint accelerations a.
+
+    Args:
+        model: the robot's model.
+        frame: index of the frame among the model's frames.
     """
     return _function(_extension().frame_drift(model.saveToString(), frame))
 
 
 def joint_placements(model: pinocchio.Model) -> casadi.Function:
-    """Return the placements of all n joints but the universe, in the model's order.
+    """Build the function from q (nq,) to the placements of the model's n joints in the root.
 
-    q (nq,) -> rotations (3, 3 n), side by side, and positions (3, n) [m], in the root.
+    Outputs: rotations (3, 3 n), side by side, and positions (3, n) [m], in the order of the model;
+    Pinocchio's "universe" is left out.
     """
     return _function(_extension().joint_placements(model.saveToString()))
 
 
 def inverse_dynamics(model: pinocchio.Model) -> casadi.Function:
-    """Return joint torques without external forces, by the recursive Newton-Euler algorithm.
+    """Build the function from q (nq,), v (nv,) and a (nv,) to joint torques (nv,) [N m].
 
-    q (nq,), v (nv,), a (nv,) -> torque (nv,) [N m]; gravity is the model's, rotor inertias count.
+    The recursive Newton-Euler algorithm includes the model's gravity and rotor inertias; there are
+    no external forces.
     """
     return _function(_extension().inverse_dynamics(model.saveToString()))
 
