@@ -80,7 +80,8 @@ class PolishFunctions:
         arms: `arms(constraint)` returns the indices of the arms on whose joints the constraint
             depends.
         model: arms and bodies of the cell.
-        separable: indices of the pairs of two boxes, for which `gaps` computes gaps.
+        separable: indices of the pairs of the payload and an obstacle that is a single box, for
+            which `gaps` computes gaps.
     """
 
     def __init__(self, compiled: CompiledCell, built: Mapping[str, NumericFunction]) -> None:
@@ -112,7 +113,7 @@ class PolishFunctions:
         return constraint.arms(self.model)
 
     def gaps(self, pair: int, pose: Array) -> Array:
-        """Compute the gaps between the two boxes of a pair along all separating directions.
+        """Compute the gaps between payload and obstacle of a pair along all separating directions.
 
         Args:
             pair: index of the pair, one of `separable`.

@@ -101,14 +101,22 @@ REST_FORCE_MARGIN = 1e-3
 
 
 def is_polishable(workcell: Workcell, robust: bool) -> bool:
-    """Return True if drivable carries of a cell can be polished. If `robust` forces are limited,
-    the cell needs two pads with opposite normals."""
+    """Return True if drivable carries of a cell can be polished.
+
+    Args:
+        workcell: the cell.
+        robust: True if the force limit applies to robust forces, for which both pads have to face
+            each other.
+    """
     return command_model(workcell).has_scalar_squeeze or not robust
 
 
 def force_range(driver: CandidateDriver) -> tuple[float, float]:
-    """Return the least and the largest force limit of the task [N]. A least limit of robust forces
-    is raised if needed to hold the box at both ends of every path."""
+    """Return the least and the largest force limit of the task [N].
+
+    If the limit applies to robust forces, the least one is at least what holds the box at rest at
+    both ends of the path.
+    """
     workcell = driver.timer.workcell
     least, most = workcell.task.force_limit
     if driver.robust:
@@ -124,10 +132,12 @@ class DriveIterate(Iterate):
     """An iterate of a drivable carry; its level is the duration [s].
 
     Attributes:
-        joints: joint positions at the grid points of the timing.
-        squared: (intervals + 1,) squared path speeds u'^2, of the timing or predicted by a program.
-        best_level: the least level so far, against which gains are measured, so that rounding of
-            the timing does not accumulate.
+        joints: (intervals + 1, n) joint positions of each arm at the grid points of the timing
+            [rad].
+        squared: (intervals + 1,) squared path speeds u'^2 [1/s^2], of the timing or as predicted by
+            a program.
+        best_level: least duration so far [s]. Steps are compared with it, so that rounding of the
+            timing does not accumulate.
     """
 
     joints: tuple[Array, Array]
@@ -140,8 +150,8 @@ class DriveStep(Step):
     """A step of path and speeds.
 
     Attributes:
-        d: scaled change of the moved waypoints.
-        squared: (intervals + 1,) predicted squared path speeds u'^2.
+        d: (n_path,) change of the program's path variables, scaled to [-1, 1] by their bounds.
+        squared: (intervals + 1,) predicted squared path speeds u'^2 [1/s^2].
         gain: predicted relative reduction of the duration.
     """
 
@@ -159,15 +169,16 @@ class _StepAnswer:
 
 
 class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
-    """Step method that minimises the duration of a drivable carry within the force limit of the
-    start. Create one per process, because it loads functions.
+    """Step method that minimises the duration of a drivable carry within its own force limit.
+
+    Create one object per process, because it loads compiled functions.
 
     Attributes:
         driver: computes timings of candidates and paths.
         force_limit: least and largest force limit [N].
-        hand_made: (n_path,) path of the hand-made trajectory.
-        coarse: the same method that moves only the waypoints of the workcell file, which
-            intermediate waypoints follow. Fewer variables need fewer and cheaper iterations.
+        hand_made: (n_path,) free waypoints of the hand-made trajectory.
+        coarse: step method that moves only the waypoints of the workcell file, which the
+            intermediate waypoints follow: fewer variables need fewer and cheaper iterations.
             Without intermediate waypoints it is this object itself.
     """
 
@@ -224,14 +235,22 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         )
 
     def _moved(self, x: Array, d: Array) -> Array:
-        """Return the decision vector (n_var,) after a scaled step d of the path."""
+        """Return the decision vector (n_var,) after a step d (n_path,) of the path variables."""
         n, task = self._n, self.cell.task
         moved = x[:n] + self._spread @ d
         return np.append(np.clip(moved, task.lower[:n], task.upper[:n]), x[n:])
 
     def evaluate_step(self, best: DriveIterate, step: DriveStep) -> StepEvaluation[DriveIterate]:
-        """Evaluate a step by the timing of the resulting path. A gain that rounding may hide is
-        accepted, unless the losses accumulate."""
+        """Evaluate a step by the fastest timing of the path to which it leads.
+
+        Shorter fractions of the step are tried until the duration falls by at least the share
+        `LEAST_REDUCTION_RATIO` of the prediction. If the prediction is smaller than the timing's
+        rounding, a step is accepted without a gain too, as long as such losses do not accumulate.
+
+        Args:
+            best: the best iterate so far, from which the step starts.
+            step: the step.
+        """
         tiny = step.gain <= TIMING_NOISE
         for fraction in DRIVE_BACKTRACKING:
             x = self._moved(best.x, fraction * step.d)
@@ -259,8 +278,17 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
     def evaluate_fraction(
         self, begin: DriveIterate, best: DriveIterate, step: DriveStep, share: float
     ) -> DriveIterate | None:
-        """Return the iterate after a fraction of a step from `begin`; None if it does not improve
-        on the best iterate."""
+        """Evaluate the candidate after a fraction of a step by its fastest timing.
+
+        Args:
+            begin: iterate from which the step starts.
+            best: the best iterate so far.
+            step: the step.
+            share: the fraction, or the multiple, of the step.
+
+        Returns:
+            The candidate; None if it is not faster than the best iterate.
+        """
         x = self._moved(begin.x, share * step.d)
         timed = self.driver.time_candidate(x)
         if timed.duration >= best.level * (1.0 - TIMING_NOISE):
@@ -270,8 +298,16 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
     def propose_step(
         self, best: DriveIterate, required: Mapping[Row, float], radius: float
     ) -> DriveStep | None:
-        """Return the step that solves the quadratic model of path and timing about the best
-        iterate, within a box of this radius; None if the model has no solution."""
+        """Solve the quadratic model of path and timing about the best iterate.
+
+        Args:
+            best: the best iterate so far.
+            required: value that each geometric row has to exceed.
+            radius: half the width of the trust region [half ranges of the variables].
+
+        Returns:
+            The step to the solution; None if the model has no solution.
+        """
         grid = self._intervals
         values = IntervalValues(
             grid, self.cell.functions, best.carry.waypoints, best.squared, best.joints
@@ -327,15 +363,20 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         box: tuple[Array, Array],
         bent: Array | float = 0.0,
     ) -> _StepAnswer | None:
-        """Solve a quadratic model repeatedly, adding violated rows to it and to `chosen`; None
-        without a solution.
+        """Solve a quadratic model, and solve it again with the timing rows that the solution
+        violates.
+
+        These rows are added to `chosen` in place.
 
         Args:
             program: program of path and timing.
-            chosen: (points, kinds) mask of the timing's rows in the model.
-            model: Hessian and gradient.
-            box: lower and upper bounds of the step.
-            bent: (geometric rows,) nonlinearity along an earlier step, which is corrected.
+            chosen: (points, kinds) mask of the timing rows in the model.
+            model: Hessian, and vector that is added to the objective's gradient.
+            box: lower and upper bounds (n,) of the step.
+            bent: (geometric rows,) nonlinearity along an earlier step, added to the geometric rows.
+
+        Returns:
+            The last solution with its rows; None if there is no solution.
         """
         g = program.gradient() + model[1]
         found: _StepAnswer | None = None
@@ -370,8 +411,10 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
     def _residuals(
         self, program: PathTimingProgram, best: DriveIterate, found: _StepAnswer
     ) -> Residuals:
-        """Compute the optimality residuals of an iterate with the multipliers of a step. Bounds of
-        the variables count, bounds of the trust region do not."""
+        """Compute the optimality residuals of an iterate with the multipliers of a step.
+
+        The variables' own bounds count as constraints, those of the trust region do not.
+        """
         (lower, upper), n, answer = self._bounds, program.n_path, found.answer
         edge, own = 1e-6 * self._unit, answer.bounds[:n]
         reached = best.x[self._own] + self._unit * answer.d[:n]

@@ -61,11 +61,11 @@ EXTRAPOLATED_SHARES = (0.5, 1.0)
 
 @dataclass(frozen=True)
 class DriveAttempt(Attempt):
-    """An attempt at the force limit in its decision vector.
+    """An attempt to reduce the duration at the force limit that its decision vector contains.
 
     Attributes:
-        moves: which waypoints are moved: 'stated' for those of the workcell file, 'all', or 'none'
-            to evaluate x unchanged.
+        moves: which waypoints the solve moves: 'stated' for those of the workcell file, 'all', or
+            'none' to evaluate x unchanged.
     """
 
     moves: Literal["stated", "all", "none"] = "stated"
@@ -73,11 +73,11 @@ class DriveAttempt(Attempt):
 
 @dataclass(frozen=True)
 class DriveGap:
-    """A gap of the front.
+    """A gap between two neighbouring points of the front.
 
     Attributes:
-        force: force limit in the middle of the gap [N].
-        ends: indices of the points on both sides.
+        force: force limit between those of both points [N].
+        ends: indices of both points in the archive.
     """
 
     force: float
@@ -85,13 +85,15 @@ class DriveGap:
 
 
 def recheck_timing(driver: CandidateDriver, model: TimingModel, x: Array) -> str:
-    """Compute the timing of a decision vector (n_var,) again on a ten times finer grid. Return the
-    reason if it fails, else ''.
+    """Check a candidate's timing against all limits on a ten times finer grid.
 
     Args:
         driver: computes timings of candidates.
         model: timing model of the driver's workcell and intervals.
-        x: decision vector.
+        x: (n_var,) decision vector.
+
+    Returns:
+        Reason why the timing fails; '' if it satisfies all limits.
     """
     timing = driver.time_candidate(np.asarray(x)).timing
     if not timing.ok:
@@ -120,8 +122,9 @@ class DriveRun(PolishRun[DriveAttempt]):
             settings: settings of the polish.
             timings: timing model with which `recheck_timing` checks results.
             archive: the front to be polished.
-            on_progress: function that is called with the attempts done and the expected total.
-            paths: (m, n_path) further known paths, which are not on the front.
+            on_progress: function called with the number of finished attempts and the expected
+                total.
+            paths: (m, n_path) free waypoints of further known paths, which are not on the front.
         """
         super().__init__(drive_method.cell.evaluator, settings, archive, on_progress)
         self._most_attempts = MOST_DRIVE_ATTEMPTS
@@ -143,8 +146,15 @@ class DriveRun(PolishRun[DriveAttempt]):
         self._still = self._least / (1.0 + REST_FORCE_MARGIN)
 
     def attempts(self, rng: np.random.Generator) -> Iterator[DriveAttempt]:
-        """Yield the attempts: polish one path by the waypoints of the file, continue it to all
-        force limits with all waypoints, then fill gaps."""
+        """Yield all attempts of the polish.
+
+        The fastest known path is polished at a low force limit by moves of the workcell file's
+        waypoints. A sweep of increasing force limits then moves all waypoints. In the end gaps of
+        the front are filled.
+
+        Args:
+            rng: not used; the attempts are not random.
+        """
         forces = map(self._used_force, self._archive.front_indices())
         fast = min((1.0 + LAST_SWEEP_MARGIN) * self._still, self._range[1])
         self._largest = max(*forces, fast, self._least)
@@ -180,9 +190,14 @@ class DriveRun(PolishRun[DriveAttempt]):
         return DriveAttempt("gap", -1, x, self._evaluator.evaluate(x).objectives[0], moves)
 
     def _rotated(self, force: float) -> list[Array]:
-        """Return starts in which the best known path and the hand-made one are rotated in every
-        direction at the waypoints of the file. If pads choose their pressure, tilting is free
-        within the patches and decides which basin a solve ends in."""
+        """Return paths (n_path,) in which the box is rotated at the waypoints of the workcell file.
+
+        The fastest known path and the hand-made one are rotated, in every direction. If pads choose
+        their pressure, tilting is free within the patches and decides in which basin a solve ends.
+
+        Args:
+            force: force limit [N] at which the rotated paths need a timing.
+        """
         paths, durations = self._known_paths(force)
         best = paths[int(np.argmin(durations))]
         task, own = self._method.cell.task, coarse_task(self._method.cell.task)
@@ -197,20 +212,26 @@ class DriveRun(PolishRun[DriveAttempt]):
         ]
 
     def _used_force(self, index: int) -> float:
-        """Return the force that the carry at an index of the archive really uses, at most its force
-        limit [N]."""
+        """Return the normal force that a carry really uses, at most its force limit [N].
+
+        Args:
+            index: index of the carry in the archive.
+        """
         share = float(self._archive.objectives[index][self._by_force])
         return min(float(self._archive.x[index][-1]), share * self._reference)
 
     def _intermediate_force(self, first: float, second: float) -> float:
-        """Return a force limit between two others [N]: the geometric mean of the forces above rest,
-        because durations depend on the square root of the force above rest."""
+        """Return a force limit [N] between the force limits `first` and `second` [N].
+
+        Its excess over the force at rest is the geometric mean of their excesses, because durations
+        depend on the square root of the excess.
+        """
         above = np.sqrt((first - self._still) * (second - self._still))
         return float(self._still + above)
 
     def _gaps(self) -> Iterator[DriveAttempt]:
-        """Yield attempts for the ends of the front from known paths, then for its widest gaps from
-        interpolated paths."""
+        """Yield attempts that evaluate known paths at both ends of the front, and interpolated
+        paths in its widest gaps."""
         members = self._settings.drivable.members
         for ahead, force in ((FRONT_ENDS, self._least), (FRONT_ENDS - 1, self._largest)):
             self._announce(ahead + members)
@@ -225,8 +246,13 @@ class DriveRun(PolishRun[DriveAttempt]):
             yield from self._fastest(np.vstack([between, self._others]), gap.force)
 
     def _fastest(self, paths: Array, force: float) -> Iterator[DriveAttempt]:
-        """Yield attempts with paths (n, n_path) at a force limit, the fastest path first, until one
-        is accepted."""
+        """Yield attempts that evaluate paths at a force limit unchanged, the fastest first, until
+        one is accepted.
+
+        Args:
+            paths: (n, n_path) free waypoints.
+            force: the force limit [N].
+        """
         self._tried.add(force)
         durations = self._driver.durations(paths, force)
         for k in np.argsort(durations, kind="stable")[:MOST_PATHS_TRIED]:
@@ -241,8 +267,15 @@ class DriveRun(PolishRun[DriveAttempt]):
                 break
 
     def _fastest_paths(self, paths: Array) -> Array:
-        """Select the paths (n, n_path) that are feasible at the largest force limit and the fastest
-        at one of some limits."""
+        """Select the paths that are the fastest within at least one of several force limits.
+
+        Args:
+            paths: (n, n_path) free waypoints. Paths that are infeasible at the task's largest force
+                limit are left out.
+
+        Returns:
+            (k, n_path) the selected paths.
+        """
         x = np.hstack([paths, np.full((len(paths), 1), self._range[1])])
         paths = paths[self._evaluator.evaluate(x).feasible]
         if not len(paths):
@@ -252,9 +285,12 @@ class DriveRun(PolishRun[DriveAttempt]):
         return np.asarray(paths[np.unique(np.argmin(durations, axis=1))])
 
     def _limits(self, least: float, fast: float, count: int) -> list[float]:
-        """Return force limits [N]: `count` from `least` to `fast`, continued with the same ratio to
-        the largest one of the front. The force above rest, which decides the duration, grows
-        geometrically."""
+        """Return increasing force limits [N] whose excess over the force at rest grows
+        geometrically.
+
+        `count` limits lie from `least` to `fast`; further ones in this ratio follow up to the
+        largest limit of the front. The excess decides the duration.
+        """
         low, high, most = np.array([least, fast, self._largest]) - self._still
         step = np.log(high / low) / max(count - 1, 1)
         if most > high and step > 0.0:
@@ -264,14 +300,15 @@ class DriveRun(PolishRun[DriveAttempt]):
         return sorted(set(limits))
 
     def _known_paths(self, force: float) -> tuple[Array, Array]:
-        """Return all known paths (n, n_path) and their durations (n,) within a force limit [s]."""
+        """Return all known paths (n, n_path), and their durations (n,) [s] within a force limit
+        [N]."""
         known = [self._archive.x[k][: self._n_path] for k in self._archive.front_indices()]
         paths = np.unique(np.vstack([*known, self._others]), axis=0)
         return paths, self._driver.durations(paths, force)
 
     def _widest_gap(self) -> DriveGap | None:
-        """Return the widest gap between neighbours on the front whose middle was not tried yet,
-        None if there is none."""
+        """Return the widest gap on the front whose force limit was not tried yet; None if there is
+        none."""
         # What is not polished yet fills no gap: it is to be improved.
         rows = [k for k in self._archive.front_indices() if self._archive.polished[k]]
         if len(rows) < 2:

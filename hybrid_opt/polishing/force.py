@@ -81,12 +81,16 @@ SolveMode = Literal["usual", "wide", "near", "brief"]
 
 @dataclass(frozen=True)
 class Scalarisation:
-    """Objective of one solve, with the symbols of the module's formula.
+    """Objective of one solve: a scalar function of both peak forces.
+
+    A peak force f_j, over the reference force, is scaled to phi_j = (f_j - anchor_j) / span_j. The
+    level a is bounded by phi_j <= direction_j a + offset_j, and cost . (a, phi_1, phi_2) is
+    minimised.
 
     Attributes:
-        anchor, span: (2,) origin and scale of each peak force over its reference.
-        direction, offset: (2,) phi_j <= direction_j a + offset_j.
-        cost: (3,) weights of the level a and of both phi.
+        anchor, span: (2,) origin and scale of each peak force.
+        direction, offset: (2,) coefficients of the bounds.
+        cost: (3,) weights of a, phi_1 and phi_2.
     """
 
     anchor: Array
@@ -97,7 +101,8 @@ class Scalarisation:
 
     @property
     def limits(self) -> MinimisedForces:
-        """For each robot, True if its objective is bounded."""
+        """For each robot, True if its peak force is bounded by the level; the other only breaks
+        ties."""
         first, second = (self.offset < UNBOUNDED_OFFSET).tolist()
         return first, second
 
@@ -107,18 +112,21 @@ class Scalarisation:
         return float(np.max((phi - self.offset)[ahead] / self.direction[ahead]))
 
     def level(self, peak: Array) -> float:
-        """Compute the minimised value of peak forces (2,) over their references."""
+        """Return cost . (a, phi_1, phi_2) for peak forces over the reference forces (2,), with the
+        least level a."""
         phi = (peak - self.anchor) / self.span
         return float(self.cost @ np.concatenate([[self.least_level(phi)], phi]))
 
 
 def pascoletti_serafini(anchor: Array, span: Array) -> Scalarisation:
-    """Return the scalarisation that moves from the anchor along the diagonal as far as possible,
-    with both objectives bounded.
+    """Return the scalarisation max_j (f_j - anchor_j) / span_j of both peak forces f_j.
+
+    Its minimum lies on the front, in the direction -span from the anchor. Small weights on both
+    peak forces break ties.
 
     Args:
-        anchor: (2,) start.
-        span: (2,) scale of each objective.
+        anchor: (2,) peak forces over the reference forces.
+        span: (2,) scale of each peak force.
     """
     return Scalarisation(
         anchor, span, np.ones(2), np.zeros(2), np.array([1.0, TIE_WEIGHT, TIE_WEIGHT])
@@ -126,7 +134,13 @@ def pascoletti_serafini(anchor: Array, span: Array) -> Scalarisation:
 
 
 def extreme_scalarisation(anchor: Array, span: Array, objective: int) -> Scalarisation:
-    """Return the scalarisation that minimises one objective; the other only breaks ties."""
+    """Return the scalarisation that minimises one peak force; the other one only breaks ties.
+
+    Args:
+        anchor: (2,) origin of the scaled peak forces.
+        span: (2,) scale of each peak force.
+        objective: index of the minimised peak force.
+    """
     free = np.where(np.arange(2) == objective, 0.0, UNBOUNDED_OFFSET)
     return Scalarisation(
         anchor, span, np.eye(2)[objective], free, np.array([1.0, TIE_WEIGHT, TIE_WEIGHT])
@@ -134,19 +148,28 @@ def extreme_scalarisation(anchor: Array, span: Array, objective: int) -> Scalari
 
 
 def balanced_scalarisation(anchor: Array, span: Array) -> Scalarisation:
-    """Return the scalarisation that minimises the sum of both objectives plus half of the larger
-    one.
+    """Return the scalarisation sum_j phi_j + `LARGER_WEIGHT` max_j phi_j of both scaled peak forces
+    phi_j.
 
     If one robot can relieve the other at little cost, both then carry alike, which leaves most room
     for payload.
+
+    Args:
+        anchor: (2,) peak forces over the reference forces; their mean is the common origin.
+        span: (2,) scale of each peak force.
     """
     middle = np.full(2, anchor.mean())
     return Scalarisation(middle, span, np.ones(2), np.zeros(2), np.array([LARGER_WEIGHT, 1.0, 1.0]))
 
 
 def scalarisation_for(anchor: Array, span: Array, objective: int | None) -> Scalarisation:
-    """Return the scalarisation of an end of a front, by its objective; of the balanced middle for
-    None."""
+    """Return the scalarisation that aims at an end of the front or at its balanced middle.
+
+    Args:
+        anchor: (2,) peak forces over the reference forces, the origin of the scaled ones.
+        span: (2,) scale of each peak force.
+        objective: index of the peak force that is least at the end; None for the balanced middle.
+    """
     return (
         balanced_scalarisation(anchor, span)
         if objective is None
@@ -155,12 +178,12 @@ def scalarisation_for(anchor: Array, span: Array, objective: int | None) -> Scal
 
 
 class ForceProgram:
-    """Nonlinear program of the module with a set of rows near one candidate.
+    """The nonlinear program of the module's formula, with chosen rows, near one candidate.
 
     Attributes:
         layout: order of the rows.
-        cost, start, low, high: objective, start and bounds of z, as in
-            `solvers.base.NonlinearProgram`.
+        cost: (n_variables,) gradient of the objective.
+        start, low, high: (n_variables,) start and bounds of z.
     """
 
     def __init__(
@@ -176,9 +199,9 @@ class ForceProgram:
 
         Args:
             cell: shared data of the cell's programs.
-            required: the rows with their required values. Force rows have no required values.
-            target: the scalarisation.
-            carry: the candidate at places of the path.
+            required: value that each row has to exceed; for force rows it is not used.
+            target: the scalarisation that is minimised.
+            carry: the candidate, evaluated at places of the path.
             x: (n_var,) decision vector of the candidate.
             radius: half the width of the trust region [half ranges of the variables].
         """
@@ -237,7 +260,8 @@ class ForceProgram:
         self._jacobian: Array | None = None
 
     def values(self, z: Array) -> Array:
-        """Return the rows (n_rows,) at z; the last evaluation is cached."""
+        """Return the values (n_rows,) of all rows at z (n_variables,). The last result is
+        cached."""
         key = z.tobytes()
         if key != self._known:
             self._values = self._rows.values(self._cell.unscaled(z[: self._n]), z[self._n :])
@@ -245,7 +269,8 @@ class ForceProgram:
         return self._values
 
     def rows(self, z: Array) -> tuple[Array, Array]:
-        """Return values (n_rows,) and slopes (n_rows, n_variables) of the rows at z."""
+        """Return values (n_rows,) and slopes (n_rows, n_variables) of all rows at z
+        (n_variables,)."""
         values = self.values(z)
         if self._jacobian is None:
             self._jacobian = self._rows.slopes()
@@ -253,7 +278,8 @@ class ForceProgram:
         return values, self._jacobian
 
     def curvature(self, z: Array, weights: Array) -> Array:
-        """Return second derivatives (n_variables, n_variables) of weights . rows at z."""
+        """Return the Hessian (n_variables, n_variables) of weights . rows at z, for weights
+        (n_rows,)."""
         self.rows(z)
         n, half = self._n, self._cell.half
         full = np.zeros((n + 3, n + 3))
@@ -261,10 +287,14 @@ class ForceProgram:
         return full
 
     def residuals_at(self, x: Array, carry: PlacedCarry) -> Residuals:
-        """Compute the optimality residuals at a candidate x with least-squares multipliers.
+        """Compute the optimality residuals of a candidate with least-squares multipliers.
 
-        Only the variables' own bounds count. Bounds of the trust region would absorb the remaining
-        reduction.
+        Only the variables' own bounds count as constraints. Bounds of the trust region would absorb
+        the remaining reduction.
+
+        Args:
+            x: (n_var,) decision vector of the candidate.
+            carry: the candidate, evaluated at places of the path.
         """
         target = self._target
         phi = (carry.peak - target.anchor) / target.span
@@ -273,15 +303,19 @@ class ForceProgram:
         return optimality_residuals(self, z, (low, high))
 
     def candidate(self, z: Array) -> Array:
-        """Return the decision vector (n_var,) in z, clipped to its bounds and to the trust
-        region."""
+        """Return the decision vector (n_var,) that z (n_variables,) contains, clipped to its bounds
+        and to the trust region."""
         n = self._n
         return self._cell.unscaled(np.clip(z[:n], self.low[:n], self.high[:n]))
 
 
 @dataclass(frozen=True, kw_only=True)
 class ForceStep(Step):
-    """A step to a decision vector x (n_var,)."""
+    """A step to a decision vector.
+
+    Attributes:
+        x: (n_var,) decision vector after the step.
+    """
 
     x: Array
 
@@ -303,14 +337,24 @@ class ForceStepMethod(StepMethod[Iterate, ForceStep]):
         self._iterations, self._barrier = iterations, barrier
 
     def evaluate(self, x: Array) -> Iterate:
-        """Evaluate a decision vector x (n_var,)."""
+        """Evaluate a decision vector x (n_var,); its level is the scalarisation of its peak
+        forces."""
         carry = self.reader.read(x)
         return Iterate(x, carry, self._target.level(carry.peak))
 
     def propose_step(
         self, best: Iterate, required: Mapping[Row, float], radius: float
     ) -> ForceStep | None:
-        """Solve the nonlinear program within the trust region."""
+        """Solve the nonlinear program about the best iterate.
+
+        Args:
+            best: the best iterate so far.
+            required: value that each row of the program has to exceed.
+            radius: half the width of the trust region [half ranges of the variables].
+
+        Returns:
+            The step to the solution; None if the solver returns no finite one.
+        """
         program = ForceProgram(self.cell, required, self._target, best.carry, best.x, radius)
         answer = self._solve(program, self._iterations, self._barrier)
         if not answer.usable:
@@ -326,28 +370,41 @@ class ForceStepMethod(StepMethod[Iterate, ForceStep]):
         )
 
     def evaluate_step(self, best: Iterate, step: ForceStep) -> StepEvaluation[Iterate]:
-        """Evaluate the candidate of a step."""
+        """Evaluate the candidate after a step, and compare its level with that of the best
+        iterate."""
         trial = self.evaluate(step.x)
         return StepEvaluation(trial, trial.level < best.level)
 
     def evaluate_fraction(
         self, begin: Iterate, best: Iterate, step: ForceStep, share: float
     ) -> Iterate | None:
-        """Evaluate the candidate at a share of a step; None if it does not improve on the best."""
+        """Evaluate the candidate after a fraction of a step.
+
+        Args:
+            begin: iterate from which the step starts.
+            best: the best iterate so far.
+            step: the step.
+            share: the fraction of the step.
+
+        Returns:
+            The candidate; None if its level is not below that of the best iterate.
+        """
         trial = self.evaluate(begin.x + share * (step.x - begin.x))
         return trial if trial.level < best.level else None
 
     def missing_rows(self, trial: Iterate) -> set[Row]:
-        """Return rows at the peaks of a candidate that the program underestimated."""
+        """Return force rows at and beside the local maxima of a candidate's minimised forces."""
         return set(self.active.forces.peak_rows(trial.carry, self.limits))
 
 
 class ForceSolver:
-    """Solver of both peak forces for the cell of one evaluator. Each process needs its own.
+    """Minimises scalarisations of both peak forces for one cell. Each process needs its own object.
 
     Attributes:
-        cell, active, reader: model, row selector and candidate reader, shared by all solves.
-        method: solver of the programs.
+        cell: shared data of the polish.
+        active: selects the rows of programs.
+        reader: evaluates candidates at places of the path.
+        method: solver of the nonlinear programs.
     """
 
     def __init__(self, cell: SmoothCell, settings: PolishSettings) -> None:
@@ -358,12 +415,13 @@ class ForceSolver:
     def solve(
         self, x: Array, target: Scalarisation, radius: float, mode: SolveMode = "usual"
     ) -> Solution:
-        """Improve a feasible decision vector x (n_var,) in the sense of a scalarisation.
+        """Improve a feasible decision vector by a trust-region solve of one scalarisation.
 
         Args:
-            target: the scalarisation.
+            x: (n_var,) feasible decision vector.
+            target: the scalarisation that is minimised.
             radius: radius of the first trust region [half ranges of the decision variables].
-            mode: effort and barrier.
+            mode: effort of the solve, see `SolveMode`.
         """
         rounds, iterations, barrier = self._settings.rounds, self._settings.max_iterations, BARRIER
         if mode == "near":

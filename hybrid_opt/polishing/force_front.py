@@ -90,8 +90,13 @@ None."""
 
 @dataclass(frozen=True)
 class ForceAttempt(Attempt):
-    """An attempt with a scalarisation of both peak forces, a first radius and a mode of the solver;
-    see `hybrid_opt.polishing.force.ForceSolver.solve`."""
+    """An attempt to improve a front by one solve of `hybrid_opt.polishing.force.ForceSolver`.
+
+    Attributes:
+        target: scalarisation of both peak forces that is minimised.
+        radius: radius of the first trust region [half ranges of the decision variables].
+        mode: effort of the solve.
+    """
 
     target: Scalarisation
     radius: float = RADIUS
@@ -99,7 +104,7 @@ class ForceAttempt(Attempt):
 
 
 def front_attempts(archive: ParetoArchive, settings: PolishSettings) -> list[ForceAttempt]:
-    """Return attempts at evenly spread points of the front, which include the balanced one."""
+    """Return attempts to improve evenly spread points of the front, the balanced one among them."""
     rows = archive.front_indices()
     count = min(len(rows), ceil(settings.attempts * OWN_SHARE))
     chosen = {rows[k] for k in evenly(len(rows), count)}
@@ -129,15 +134,16 @@ def extreme_attempt(
 
     It starts from the best point so far. If that was tried or the last attempt brought no progress,
     an attempt at an end starts from a perturbation of the best point, because ends lie in several
-    basins; an attempt at the middle starts from a random other point, which may be dominated.
+    basins. An attempt at the middle then starts from another point at random, which may be
+    dominated.
 
     Args:
         archive: the front so far.
         objective: index of the objective that is least at the end; None for the balanced middle.
-        tried: objective and bytes of the start of all attempts so far.
+        tried: objective and start, as bytes, of all attempts so far.
         stalled: whether the last attempt brought no progress.
-        perturb: function that perturbs a start.
-        rng: random generator.
+        perturb: function from a decision vector and an objective to a perturbed start.
+        rng: generator that chooses the other point.
     """
     radius, k = RADIUS, archive.best(objective)[0]
     fresh = [row for row, x in enumerate(archive.x) if (objective, x.tobytes()) not in tried]
@@ -157,8 +163,12 @@ def extreme_attempt(
 
 
 def refinement_attempt(archive: ParetoArchive, objective: int | None) -> ForceAttempt:
-    """Return an attempt to solve the best point at an end, or at the balanced middle if `objective`
-    is None, to high accuracy."""
+    """Return an attempt to solve the best point at an end of the front to high accuracy.
+
+    Args:
+        archive: the front so far.
+        objective: index of the objective that is least at the end; None for the balanced middle.
+    """
     k, span = archive.best(objective)[0], archive.span()
     x, start = archive.x[k], archive.objectives[k]
     target = scalarisation_for(start, span, objective)
@@ -167,26 +177,34 @@ def refinement_attempt(archive: ParetoArchive, objective: int | None) -> ForceAt
 
 
 def probe_attempt(start: Start, objective: int | None) -> ForceAttempt:
-    """Return a short solve from a start towards an end of the front, or towards the balanced middle
-    if `objective` is None."""
+    """Return a short solve from a start towards an end of the front.
+
+    Args:
+        start: the start.
+        objective: index of the objective that is least at the end; None for the balanced middle.
+    """
     target = scalarisation_for(start.objectives, np.full(2, LEAST_SPAN), objective)
     return ForceAttempt("probe", -1, start.x, start.objectives, target, mode="brief")
 
 
 def better_half(reached: list[Start], objective: int | None) -> list[Start]:
-    """Return the better half of the starts, the best first; none if there is only one."""
+    """Return the better half of the starts, the best first; none if there is only one.
+
+    Starts are compared by the objective with this index, or by the sum of both for None.
+    """
     ranked = sorted(reached, key=lambda start: start.value(objective))
     return ranked[: len(reached) // 2]
 
 
 @dataclass(frozen=True)
 class GapAttempt:
-    """An attempt to find a point in a gap.
+    """An attempt to find a point in a gap of the front.
 
     Attributes:
         attempt: the solve.
-        edge: the side of the gap that it starts from.
-        step: distance of its aim along the front [front's extent].
+        edge: the side of the gap from which the solve starts.
+        step: distance along the front from the start to the point that is aimed at [front's
+            extent].
     """
 
     attempt: ForceAttempt
@@ -196,12 +214,12 @@ class GapAttempt:
 
 @dataclass(frozen=True)
 class ForceGap:
-    """A gap between two neighbours on a front.
+    """A gap between two neighbouring points of a front.
 
     Attributes:
-        first, second: indices of the neighbours in the archive, sorted by the first objective.
-        width: root of the area that a point in the gap can still dominate, at least a share of the
-            length [front's extent].
+        first, second: indices of both points in the archive, sorted by the first objective.
+        width: square root of the area that a point in the gap can still dominate, at least a share
+            of the length [front's extent].
         length: sum of the differences of both objectives [front's extent].
     """
 
@@ -230,17 +248,17 @@ def gap_attempt(
     stride: float = STRIDE,
     far: float = FAR_GAP,
 ) -> GapAttempt | None:
-    """Return an attempt in the widest gap, from a side that was not tried.
+    """Return an attempt in the widest gap, from a side from which none started yet.
 
-    If continuations from both sides failed, because the front jumps there, and the gap is wider
-    than `far`, the attempt aims at its middle with a large radius.
+    If solves from both sides failed, because the front jumps there, and the gap is wider than
+    `far`, the attempt aims at the gap's middle with a large radius.
 
     Args:
         archive: the front so far.
         tried: sides of gaps from which attempts started.
         solved: number of points with which the front is complete.
-        stride: largest distance along the front to the aim [front's extent].
-        far: width above which a gap is far too wide [front's extent].
+        stride: largest distance along the front from start to aim [front's extent].
+        far: width of a gap above which the large radius is tried [front's extent].
 
     Returns:
         The attempt; None if the front is complete, or all sides of gaps were tried.
@@ -271,23 +289,28 @@ def gap_attempt(
 def made_little_progress(
     archive: ParetoArchive, gap_attempt: GapAttempt, objectives: Array
 ) -> bool:
-    """Return True if the result of an attempt, with these objectives (2,), is hardly farther along
-    the front than its start."""
+    """Return True if an attempt's result lies hardly farther along the front than its start.
+
+    Args:
+        archive: the front so far.
+        gap_attempt: the attempt.
+        objectives: (2,) objectives of the result.
+    """
     moved = np.abs(objectives - gap_attempt.attempt.start) / archive.span()
     return float(moved.sum()) < LITTLE_PROGRESS * gap_attempt.step
 
 
 def _target(archive: ParetoArchive, k: int, step: float) -> Scalarisation:
-    """Return the scalarisation that aims along the front from point k, by a signed step [front's
-    extent]."""
+    """Return the scalarisation that aims at a point of the front beside point `k` of the archive,
+    at a signed distance `step` along the front [front's extent]."""
     span = archive.span()
     aside = np.array([0.5, -0.5]) * step * span
     return pascoletti_serafini(archive.objectives[k] + aside, span)
 
 
 def widest_untried_gap(archive: ParetoArchive, tried: Collection[Chord]) -> ForceGap | None:
-    """Return the widest gap between two polished points whose chord was not tried, None if there is
-    none."""
+    """Return the widest gap between two polished points whose chord is not in `tried`; None if
+    there is none."""
     for gap in sorted(gaps(archive), key=lambda gap: -gap.width):
         is_polished = archive.polished[gap.first] and archive.polished[gap.second]
         if is_polished and chord_across(archive, gap) not in tried:
@@ -296,18 +319,18 @@ def widest_untried_gap(archive: ParetoArchive, tried: Collection[Chord]) -> Forc
 
 
 def chord_across(archive: ParetoArchive, gap: ForceGap) -> Chord:
-    """Return the chord between the two points beside a gap."""
+    """Return the decision vectors on both sides of a gap, as bytes."""
     return archive.x[gap.first].tobytes(), archive.x[gap.second].tobytes()
 
 
 def best_on_chord(
     evaluator: CandidateEvaluator, archive: ParetoArchive, gap: ForceGap
 ) -> tuple[Array, Array] | None:
-    """Return the feasible point on the chord of a gap that dominates the largest area of the gap.
+    """Evaluate points on the chord of a gap, the line between both neighbours' decision vectors.
 
     Returns:
-        Decision vector (n_var,) and objectives (2,); None if all points are dominated or
-        infeasible.
+        Decision vector (n_var,) and objectives (2,) of the feasible point that dominates the
+        largest area of the gap; None if all points are dominated or infeasible.
     """
     share = np.arange(1, CHORD + 1)[:, None] / (CHORD + 1)
     x = (1.0 - share) * archive.x[gap.first] + share * archive.x[gap.second]
@@ -347,9 +370,15 @@ class ForceRun(PolishRun[ForceAttempt]):
         return found
 
     def attempts(self, rng: np.random.Generator) -> Iterator[ForceAttempt]:
-        """Yield the attempts: at points of the front, then probes far from it, then at ends and
-        middle in turns, then in gaps. Mirror images of results are added at once; they and points
-        on chords are certified in the end."""
+        """Yield all attempts of the polish.
+
+        They are: at points of the front; short probes far from it; at its ends and its middle in
+        turns; in its gaps. Mirror images of results are added at once. These and points on chords
+        are certified in the end.
+
+        Args:
+            rng: generator of random starts.
+        """
         first, fill = front_attempts(self._archive, self._settings), self._settings.fill
         self._ahead = max(self._attempts_left() - len(first), 0)
         aims = (0, 1, None) if self._mirror is None else (0, None)
@@ -377,8 +406,11 @@ class ForceRun(PolishRun[ForceAttempt]):
             self._certify_unproven()
 
     def _probes(self, objective: int | None, rng: np.random.Generator) -> Iterator[ForceAttempt]:
-        """Yield short solves from random feasible candidates and from the best point, then from the
-        better half of their results, until one is left (successive halving)."""
+        """Yield short solves far from the front by successive halving.
+
+        They start from random feasible candidates and from the best point, then from the better
+        half of the results, until one is left.
+        """
         count = self._starts(objective)
         if not count:
             return
@@ -398,16 +430,21 @@ class ForceRun(PolishRun[ForceAttempt]):
             pool = better_half(reached, objective)
 
     def _starts(self, objective: int | None) -> int:
-        """Return the number of starts of short solves, at most twice the number of remaining
-        attempts."""
+        """Return the number of starts of short solves towards an end or the balanced middle (None),
+        at most twice the number of remaining attempts."""
         probe = self._settings.probe
         count = probe.starts if self._mirror is not None else (probe.starts + 1) // 2
         return min(2 * self._ahead, probe.middle_starts if objective is None else count)
 
     def _remove_probes(self) -> list[tuple[Array, Array]]:
-        """Remove the results of probes from the archive, except those at the ends and the middle,
-        and return them. They are deliberately unfinished and would occupy gaps that are to be
-        filled."""
+        """Remove the results of probes from the archive, except the best points at both ends and
+        the middle.
+
+        Unfinished points would occupy gaps that are to be filled.
+
+        Returns:
+            Decision vector (n_var,) and objectives (2,) of each removed point.
+        """
         archive = self._archive
         kept = {archive.best(objective)[0] for objective in (0, 1, None)}
         probed = [k for k, x in enumerate(archive.x) if x.tobytes() in self._probed]
@@ -417,8 +454,14 @@ class ForceRun(PolishRun[ForceAttempt]):
         return found
 
     def _restore_probes(self, probed: list[tuple[Array, Array]]) -> None:
-        """Add removed results of probes again that lie in far too wide gaps or beyond the ends, or
-        all non-dominated ones if the front has fewer points than wanted."""
+        """Add removed results of probes again where the front needs them.
+
+        That is in gaps wider than `FAR_GAP` and beyond the ends. If the front has fewer points than
+        wanted, all non-dominated results are added.
+
+        Args:
+            probed: decision vector (n_var,) and objectives (2,) of each removed point.
+        """
         for x, objectives in probed:
             wanted = self._is_short or self._is_far(objectives)
             if wanted and not self._archive.dominates(objectives):
@@ -439,8 +482,8 @@ class ForceRun(PolishRun[ForceAttempt]):
         return gaps(self._archive)[place - 1].width > FAR_GAP
 
     def _gaps(self, solved: int) -> Iterator[ForceAttempt]:
-        """Yield attempts in gaps until the front is complete or all sides of gaps were tried; then
-        add points on chords."""
+        """Yield attempts in gaps until the front has `solved` points or all sides of gaps were
+        tried; then add points on chords."""
         tried: set[Edge] = set()
         self._most_attempts += self._settings.fill.attempts * self._settings.attempts
         while self._attempts_left() > 0:
@@ -471,8 +514,7 @@ class ForceRun(PolishRun[ForceAttempt]):
                 self._add_image(found[0])
 
     def _reflected(self, edge: Edge) -> Edge:
-        """Return the mirror image of a side of a gap, or the side itself if the cell has no mirror
-        symmetry."""
+        """Return the mirror image of one side of a gap; the side itself without mirror symmetry."""
         start, across, near = edge
         return self._reflected_bytes(start), self._reflected_bytes(across), near
 
@@ -509,8 +551,10 @@ class ForceRun(PolishRun[ForceAttempt]):
             self._add_image(outcome.x)
 
     def _evaluate(self, attempt: ForceAttempt, x: Array) -> Evaluations:
-        """Evaluate x (n_var,) by the full model. Results of probes are certified only if they
-        remain on the front."""
+        """Evaluate x (n_var,) by the full model and certify it, unless it results from a probe.
+
+        Results of probes are certified later, if they remain on the front.
+        """
         if attempt.mode == "brief":
             return self._evaluator.evaluate(x)
         return super()._evaluate(attempt, x)
@@ -524,8 +568,8 @@ class ForceRun(PolishRun[ForceAttempt]):
             self._unproven.add(image.tobytes())
 
     def _certify_unproven(self) -> None:
-        """Certify the points of the front that no solve certified, and remove those that collide
-        between the samples, until all points are certified."""
+        """Certify the front's points that are not certified yet, and remove those that collide
+        between the samples, until all points of the front are certified."""
         while standing := [
             k
             for k in self._archive.front_indices()

@@ -39,23 +39,37 @@ OPTIMAL_STATIONARITY = 1e-3
 
 
 class ParetoArchive:
-    """Points of a front during its polish: those of the given front, and new ones."""
+    """Points of a front during its polish: those of the given front, and new ones.
+
+    Attributes:
+        x: decision vectors (n_var,), one per point.
+        objectives: objectives (2,) of each point.
+        parent: index of each point in the given front, -1 for a new point.
+        polished: True for each point that the polish made.
+    """
 
     def __init__(self, x: Array, objectives: Array, parent: list[int]) -> None:
         self.x, self.objectives = list(x), list(objectives)
         self.parent, self.polished = list(parent), [False] * len(x)
 
     def replace(self, parent: int, x: Array, objectives: Array) -> None:
-        """Replace point `parent` of the given front by a polished point."""
+        """Replace a point of the given front by a polished point.
+
+        Args:
+            parent: index of the point in the given front.
+            x: (n_var,) decision vector of the polished point.
+            objectives: (2,) its objectives.
+        """
         index = self.parent.index(parent)
         self.x[index], self.objectives[index], self.polished[index] = x, objectives, True
 
     def dominates(self, objectives: Array) -> bool:
-        """Return True if a point of the archive is at least as good as these objectives in both."""
+        """Return True if any point of the archive is at least as good as `objectives` (2,) in both
+        of them."""
         return bool(np.any(np.all(np.array(self.objectives) <= objectives, axis=1)))
 
     def add(self, x: Array, objectives: Array) -> None:
-        """Add a new point."""
+        """Add a new point with decision vector x (n_var,) and objectives (2,)."""
         self.x.append(x)
         self.objectives.append(objectives)
         self.parent.append(-1)
@@ -74,8 +88,10 @@ class ParetoArchive:
         return [int(k) for k in kept[np.lexsort(values[kept].T[::-1])]]
 
     def best(self, objective: int | None) -> tuple[int, float]:
-        """Return the index of the point with the least value of an objective, or of the sum of both
-        if `objective` is None, and this value."""
+        """Return the index and the value of the point with the least value.
+
+        The value is the objective with index `objective`, or the sum of both objectives for None.
+        """
         wanted = np.ones(2) if objective is None else np.eye(2)[objective]
         values = {k: float(wanted @ self.objectives[k]) for k in self.front_indices()}
         index = min(values, key=lambda k: values[k])
@@ -126,7 +142,8 @@ class PolishRun(ABC, Generic[AnyAttempt]):
 
     @abstractmethod
     def attempts(self, rng: np.random.Generator) -> Iterator[AnyAttempt]:
-        """Yield the attempts. The result of each is recorded before the next one is requested."""
+        """Yield the attempts one by one. The result of each is recorded before the next one is
+        made."""
 
     @abstractmethod
     def _solve(self, attempt: AnyAttempt) -> Solution:
@@ -136,8 +153,12 @@ class PolishRun(ABC, Generic[AnyAttempt]):
     def _classify(
         self, attempt: AnyAttempt, answer: Solution, objectives: Array
     ) -> tuple[Status, str, Array]:
-        """Return the result of a feasible answer: its status (accepted, optimal or rejected), the
-        reason and the objectives."""
+        """Judge the objectives (2,) of an answer that the full model found feasible.
+
+        Returns:
+            Status (accepted, optimal or rejected); the reason, '' if accepted; and the objectives
+            (2,) to record: the answer's if accepted, else the start's.
+        """
 
     def run(self, rng: np.random.Generator) -> None:
         """Solve, check and record attempts as long as there are any."""
@@ -186,8 +207,11 @@ class PolishRun(ABC, Generic[AnyAttempt]):
             self._archive.add(outcome.x, outcome.objectives)
 
     def _status(self, attempt: AnyAttempt, answer: Solution) -> tuple[Status, str, Array]:
-        """Evaluate an answer in full and certify it between the samples. Return its status, the
-        reason and the objectives."""
+        """Evaluate an answer by the full model and certify it between the samples.
+
+        Returns:
+            Status, reason and objectives (2,) of the attempt, as `PolishOutcome` records them.
+        """
         if not answer.usable:
             return "failed", answer.message, attempt.start
         # An answer without any iteration is a point to verify as it is.

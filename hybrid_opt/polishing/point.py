@@ -50,16 +50,20 @@ HIGH_RATIO, LOW_RATIO = 0.7, 0.3
 class TrustRegion:
     """Radius of the trust region and its update rule.
 
-    The region is a box, so that it adds only bounds to a program. New rows count before the
-    reduction ratio: a step that violated a new row is repeated at the same radius with that row in
-    the program.
+    The region is a box, so that it adds only bounds to a program. A step that violated a row which
+    its program lacked is repeated at the same radius with this row.
 
     Attributes:
         radius: half the width of the box [half ranges of the decision variables].
     """
 
     def __init__(self, radius: float, least: float) -> None:
-        """Start with a radius; a radius below `least` ends the solve."""
+        """Start with a radius.
+
+        Args:
+            radius: half the width of the first box [half ranges of the decision variables].
+            least: radius below which the solve ends.
+        """
         self.radius, self._least, self._was_good = radius, least, False
 
     @property
@@ -68,7 +72,8 @@ class TrustRegion:
         return self.radius < self._least
 
     def is_step_bounded(self, length: float) -> bool:
-        """Return True if a step of this length was limited by the box."""
+        """Return True if the box limited a step whose largest change of a scaled variable is
+        `length`."""
         return length >= BOUNDED_SHARE * self.radius
 
     def on_failed_subproblem(self) -> None:
@@ -76,12 +81,23 @@ class TrustRegion:
         self.radius *= QUARTERED
 
     def on_no_improvement(self, length: float, factor: float = QUARTERED) -> None:
-        """Shrink the radius after a step of this length without improvement."""
+        """Shrink the radius after a step that violated nothing but did not improve.
+
+        Args:
+            length: largest change of a scaled variable in the step.
+            factor: factor on the smaller one of radius and length.
+        """
         self.radius = min(self.radius, length) * factor
 
     def on_reject(self, is_new: bool, length: float = np.inf) -> None:
-        """Shrink the radius after a rejected step. If a violated row is new, the model was wrong
-        and not the radius, which then stays."""
+        """Halve the radius after a rejected step.
+
+        Args:
+            is_new: True if a violated row is new; the radius then stays, because the program was
+                wrong.
+            length: largest change of a scaled variable in the step, from which the radius is halved
+                if it is smaller than the radius.
+        """
         self._was_good = False
         if not is_new:
             self.radius = HALVED * min(self.radius, length)
@@ -89,14 +105,14 @@ class TrustRegion:
     def on_accept(
         self, length: float, reduction_ratio: float | None = None, is_partial: bool = False
     ) -> None:
-        """Update the radius after an accepted step of this length.
+        """Update the radius after an accepted step.
 
         Args:
-            length: largest change of a scaled variable.
+            length: largest change of a scaled variable in the step.
             reduction_ratio: actual over predicted reduction; None without a prediction. The radius
                 then grows after two accepted steps in a row.
-            is_partial: True if only a fraction of the step was accepted; the radius becomes the
-                length of the fraction.
+            is_partial: True if only a fraction of the step was accepted; `length` is that of the
+                fraction, and becomes the radius.
         """
         if is_partial:
             self.radius = length
@@ -115,11 +131,12 @@ class Solution:
     Attributes:
         x: (n_var,) best candidate; the start if nothing improved on it.
         message: text on how the solve ended.
-        converged: True if it ended at a stationary point, as the solver reports.
+        converged: True if the solver reports that x is a stationary point.
         usable: True if the start could be evaluated.
         residuals: optimality residuals at x, of the last program.
-        iterations, rounds: number of solver iterations and of trust-region iterations in all.
-        rows: rows at places of the path in the last program.
+        iterations: number of solver iterations, over all trust-region iterations.
+        rounds: number of trust-region iterations.
+        rows: number of rows at places of the path in the last program.
     """
 
     x: Array
@@ -138,8 +155,9 @@ class Iterate:
 
     Attributes:
         x: (n_var,) decision vector.
-        carry: the candidate at places of the path.
-        level: the value that is minimised.
+        carry: the candidate, evaluated at places of the path.
+        level: the value that the solve minimises: a scalarisation of peak forces, or the duration
+            [s].
     """
 
     x: Array
@@ -179,14 +197,14 @@ class StepEvaluation(Generic[AnyIterate]):
     """Evaluation of a step by the full model.
 
     Attributes:
-        trial: iterate after the step; None if it is no improvement and adds no row.
-        improved: True if it has a lower level.
-        factor: factor of the radius after a step without improvement.
-        reduction_ratio: actual over predicted reduction, None without a prediction.
-        fraction: fraction of the step that was evaluated.
+        trial: iterate after the step; None if the step is no improvement and adds no row.
+        improved: True if the trial has a lower level than the best iterate.
+        factor: factor on the radius after a step without improvement.
+        reduction_ratio: actual over predicted reduction of the level; None without a prediction.
+        fraction: fraction of the step that leads to the trial.
         exceeds_prediction: True if the reduction is larger than predicted, so that longer steps are
             worth trying.
-        keep_active_set: True if the next program keeps the active set.
+        keep_active_set: True if the next program keeps the active rows.
     """
 
     trial: AnyIterate | None
@@ -199,20 +217,20 @@ class StepEvaluation(Generic[AnyIterate]):
 
 
 class StepMethod(ABC, Generic[AnyIterate, AnyStep]):
-    """Objective of a solve: proposes steps and evaluates them.
+    """Proposes and evaluates the steps of a solve.
 
     Attributes:
         cell: shared data of the polish.
         active: selects the rows near a candidate.
         reader: evaluates candidates at places of the path.
-        half: (n,) half ranges of the variables that steps change.
-        limits: see `MinimisedForces`.
+        half: (n,) half ranges of the variables that steps change [m, rad].
+        limits: for each robot, True if its normal force is minimised.
         least_radius: radius below which the solve ends.
         shrinks_below_step: True if a rejected step reduces the radius below the step's own length.
-        relaxes_until_improved: True if rows require no more than the iterate satisfies until a step
-            improves; otherwise only in the first iteration. A start may be nearer to obstacles than
-            the wanted clearance.
-        backtracking: fractions of a rejected step that are tried instead, the longest first.
+        relaxes_until_improved: True if distance rows require no more than the iterate satisfies
+            until a step improves; otherwise only in the first iteration. A start may be nearer to
+            obstacles than the wanted clearance.
+        backtracking: fractions of a rejected step that are tried in its place, the longest first.
         extrapolation: multiples of a step that are tried after it exceeded its prediction, the
             shortest first.
     """
@@ -230,29 +248,48 @@ class StepMethod(ABC, Generic[AnyIterate, AnyStep]):
 
     @abstractmethod
     def evaluate(self, x: Array) -> AnyIterate:
-        """Evaluate a decision vector (n_var,)."""
+        """Evaluate a decision vector x (n_var,) by the full model."""
 
     @abstractmethod
     def propose_step(
         self, best: AnyIterate, required: Mapping[Row, float], radius: float
     ) -> AnyStep | None:
-        """Return a step within the box of this radius about the best iterate, such that rows exceed
-        their required values; None if the program has no solution."""
+        """Propose a step by a program about the best iterate.
+
+        Args:
+            best: the best iterate so far.
+            required: value that each row of the program has to exceed.
+            radius: half the width of the trust region [half ranges of the variables].
+
+        Returns:
+            The step; None if the program has no solution.
+        """
 
     @abstractmethod
     def evaluate_step(self, best: AnyIterate, step: AnyStep) -> StepEvaluation[AnyIterate]:
-        """Evaluate the candidate after a step."""
+        """Evaluate the candidate after a step from the best iterate."""
 
     @abstractmethod
     def evaluate_fraction(
         self, begin: AnyIterate, best: AnyIterate, step: AnyStep, share: float
     ) -> AnyIterate | None:
-        """Return the iterate after a fraction of a step from `begin`; None if it does not improve
-        on the best iterate."""
+        """Evaluate the candidate after a fraction of a step.
+
+        Args:
+            begin: iterate from which the step starts.
+            best: the best iterate so far.
+            step: the step.
+            share: the fraction, or the multiple, of the step.
+
+        Returns:
+            The candidate; None if it does not improve on the best iterate.
+        """
 
     def missing_rows(self, trial: AnyIterate) -> set[Row]:
-        """Return rows that the program of a step without improvement did not contain and should
-        have."""
+        """Return rows that a program should have contained, found at the candidate after its step.
+
+        It is called after a step that violated nothing but did not improve.
+        """
         return set()
 
 
@@ -270,7 +307,7 @@ class TrustRegionSolve(Generic[AnyIterate, AnyStep]):
         Args:
             method: proposes and evaluates steps.
             x: (n_var,) feasible decision vector.
-            radius: radius of the first trust region.
+            radius: half the width of the first trust region [half ranges of the variables].
         """
         self._method, task = method, method.cell.task
         self.best = method.evaluate(np.clip(x, task.lower, task.upper))
@@ -290,8 +327,8 @@ class TrustRegionSolve(Generic[AnyIterate, AnyStep]):
 
         Args:
             rounds: largest number of iterations.
-            least_gain: least relative reduction of the level by two successive iterations; with
-                less, the solve is left. It applies after the first accepted step, because rejected
+            least_gain: least relative reduction of the level by two successive iterations, below
+                which the solve stops. It applies after the first accepted step, because rejected
                 steps before it only add rows.
         """
         solution, levels = self.solution, [self.best.level]
@@ -370,8 +407,15 @@ class TrustRegionSolve(Generic[AnyIterate, AnyStep]):
         )
 
     def _keep_best(self, step: AnyStep, trial: AnyIterate) -> None:
-        """React to a feasible step without improvement: add missing rows, or finish at an optimum,
-        or shrink the radius."""
+        """React to a step that violates nothing but does not improve.
+
+        Rows that the program lacked are added. Without such rows the solve finishes if the step is
+        optimal and inside the box, else the radius shrinks.
+
+        Args:
+            step: the step.
+            trial: candidate after the step.
+        """
         asked = self._method.missing_rows(trial) - step.required.keys()
         self._working_set.add(asked, trial.x)
         if step.converged and not asked and not self._region.is_step_bounded(step.length):
@@ -384,8 +428,17 @@ class TrustRegionSolve(Generic[AnyIterate, AnyStep]):
     def _try_fraction(
         self, begin: AnyIterate, step: AnyStep, share: float, keep_active_set: bool = False
     ) -> bool:
-        """Accept a fraction of a step if it improves the level and violates nothing. Return True if
-        it was accepted."""
+        """Accept the candidate after a fraction of a step if it improves and violates nothing.
+
+        Args:
+            begin: iterate from which the step starts.
+            step: the step.
+            share: the fraction, or the multiple, of the step.
+            keep_active_set: True to keep the active rows for the next program.
+
+        Returns:
+            True if the candidate was accepted.
+        """
         trial = self._method.evaluate_fraction(begin, self.best, step, share)
         if trial is None or not trial.carry.is_reachable:
             return False

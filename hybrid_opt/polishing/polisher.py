@@ -31,8 +31,14 @@ TIMED_EVALUATIONS = 32
 
 
 def has_polishable_forces(workcell: Workcell, objectives: Sequence[str]) -> bool:
-    """Return True if the polish supports the forces in the objectives: planned forces of all pads,
-    and robust forces of two pads with opposite normals."""
+    """Return True if the polish supports the forces among the objectives.
+
+    It supports planned forces of all pads, and robust forces of two pads with opposite normals.
+
+    Args:
+        workcell: the cell.
+        objectives: names of the objectives.
+    """
     return command_model(workcell).has_scalar_squeeze or tuple(objectives) != ROBUST_OBJECTIVES
 
 
@@ -42,7 +48,7 @@ class Polisher:
     Attributes:
         evaluator: evaluator of candidates by the full model.
         settings: settings of the polish.
-        solver: solver that minimises both peak forces; None in drivable cells.
+        solver: minimises scalarisations of both peak forces; None in drivable cells.
         drive_method: step method of drivable carries; None with other time laws.
     """
 
@@ -55,18 +61,17 @@ class Polisher:
         settings: PolishSettings,
         functions: PolishFunctions | None = None,
     ) -> None:
-        """Prepare the polish of the evaluator's cell.
+        """Load or build the functions for the polish of the evaluator's cell.
 
         Args:
-            evaluator: evaluator of candidates with the full model.
+            evaluator: evaluator of candidates by the full model.
             settings: settings of the polish.
             functions: compiled functions of the cell; None loads or builds them.
 
         Raises:
-            SettingsError: the evaluator's objectives are not those of the polish: both peak forces,
-                planned or robust, or in drivable cells duration and one of them; the
-                pads do not close their grasp, or robust forces are those of pads without opposite
-                normals.
+            SettingsError: the polish does not support the evaluator's objectives (it needs both
+                peak forces, planned or robust; in drivable cells duration and one of these), or it
+                does not support the cell's pads.
             DualArmError: the functions cannot be built.
         """
         self.evaluator, self.settings = evaluator, settings
@@ -90,11 +95,12 @@ class Polisher:
         """Polish a front.
 
         Args:
-            front_x: (k, n_var) decision vectors; k may be 0.
-            rng: random generator for the starts of attempts at the balanced middle.
-            paths: (m, n_path) known good free waypoints, not necessarily on the front; only the
-                polish of drivable carries uses them. None for none.
-            on_progress: function called with the attempts done and the expected total.
+            front_x: (k, n_var) decision vectors of the front; k may be 0.
+            rng: generator of random starts.
+            paths: (m, n_path) free waypoints of known good paths, not necessarily on the front;
+                only the polish of drivable carries uses them. None for none.
+            on_progress: function called with the number of finished attempts and the expected
+                total.
         """
         begin = time.perf_counter()
         x = np.asarray(front_x, dtype=float).reshape(-1, self.evaluator.n_var)
@@ -127,8 +133,11 @@ class Polisher:
         )
 
     def _evaluation_seconds(self, x: Array) -> float:
-        """Return the time of one candidate's evaluation [s], measured with the front's candidates,
-        or the initial trajectory for an empty front."""
+        """Measure the time of one candidate's evaluation [s].
+
+        Args:
+            x: (k, n_var) candidates to evaluate; the hand-made trajectory if k is 0.
+        """
         sample = x if len(x) else initial_decision(self.evaluator.workcell.task)[None]
         batch = np.resize(sample, (TIMED_EVALUATIONS, self.evaluator.n_var))
         begin = time.perf_counter()

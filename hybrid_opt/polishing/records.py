@@ -60,14 +60,15 @@ class PolishEffort:
         solver: solver of the programs: 'dense', 'ipopt', or 'quadratic' for drivable carries.
         attempts: number of attempts.
         counts: number of attempts by status; attempts not accepted also by 'status: reason'.
-        success_share: share of the attempted points of the given front that are accepted or
-            optimal.
-        seconds, median_attempt_seconds: time in total and median per attempt [s].
-        equivalent_evaluations: number of candidate evaluations that take as long.
+        success_share: of the attempts to improve a point of the given front, the share that ended
+            as accepted or optimal.
+        seconds: total wall time [s].
+        median_attempt_seconds: median wall time of an attempt [s].
+        equivalent_evaluations: number of candidate evaluations that take as long as the polish.
         widest_gap: largest distance between neighbours, as a share of the front's length along both
             objectives; NaN for fewer than two points.
-        worst_stationarity, worst_feasibility, median_stationarity: residuals of the points on the
-            final front that a solve made.
+        worst_stationarity, worst_feasibility, median_stationarity: largest and median optimality
+            residuals of those points on the final front that a solve made.
     """
 
     solver: str

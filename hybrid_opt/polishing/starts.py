@@ -56,17 +56,17 @@ LEAST_ROTATION = 0.1
 def first_feasible(
     evaluator: CandidateEvaluator, x: Array, count: int, objective: int | None = None
 ) -> tuple[NDArray[np.intp], Array]:
-    """Find the first feasible ones among n candidates.
+    """Find the first feasible candidates in a sequence.
 
     Args:
         evaluator: evaluator of the candidates.
         x: (n, n_var) candidates.
         count: largest number of candidates to find.
-        objective: index of the objective by which candidates are sorted, lowest first; None keeps
-            their order.
+        objective: index of the objective by which candidates are sorted before, lowest first; None
+            keeps their order.
 
     Returns:
-        Indices (k,) and objectives (k, m) of the feasible candidates.
+        Indices (k,) into x and objectives (k, n_obj) of the feasible candidates.
     """
     but_collisions = evaluator.evaluate(x, with_collisions=False)
     rows = np.flatnonzero(but_collisions.feasible)
@@ -94,16 +94,18 @@ def perturb_start(
     """Draw candidates that differ from x in a few variables, and return the best feasible one.
 
     Args:
+        evaluator: evaluator of the candidates.
         x: (n_var,) decision vector.
-        evaluator: evaluator of candidates.
         objective: index of the objective that decides which candidate is best.
         rng: generator of the candidates.
-        candidates: number of candidates.
+        candidates: number of candidates to draw.
         share: probability that a variable is drawn anew.
-        away: least change of the variable that changes most, as a share of its range.
+        away: least change of a candidate's most changed variable, as a share of the variable's
+            range; candidates with smaller changes are left out.
 
     Returns:
-        The best candidate (n_var,) and its objectives (2,); None if no candidate is feasible.
+        Decision vector (n_var,) and objectives (2,) of the best candidate; None if no candidate is
+        feasible.
     """
     low, high = evaluator.lower, evaluator.upper
     shape = candidates, len(x)
@@ -132,14 +134,14 @@ class Start:
     is_exhausted: bool = False
 
     def value(self, objective: int | None) -> float:
-        """Return the objective with this index; the sum of both for None."""
+        """Return the objective with this index, or the sum of both objectives for None."""
         return float(self.objectives.sum() if objective is None else self.objectives[objective])
 
 
 def random_starts(
     evaluator: CandidateEvaluator, count: int, rng: np.random.Generator
 ) -> list[Start]:
-    """Draw random candidates and return at most `count` feasible ones."""
+    """Draw `RANDOM_CANDIDATES` uniform candidates and return at most `count` feasible ones."""
     shape = RANDOM_CANDIDATES, evaluator.n_var
     candidates = rng.uniform(evaluator.lower, evaluator.upper, shape)
     rows, objectives = first_feasible(evaluator, candidates, count)
@@ -152,7 +154,7 @@ class Mirror:
 
     Attributes:
         task: task of the cell.
-        sign, shift: (n_var,) image = sign * x + shift.
+        sign, shift: (n_var,) coefficients: the image of x is sign * x + shift.
     """
 
     task: Task
@@ -160,16 +162,19 @@ class Mirror:
     shift: Array
 
     def image(self, x: Array) -> Array | None:
-        """Return the mirror image of a decision vector (n_var,); None if it is outside the
-        bounds."""
+        """Return the mirror image (n_var,) of a decision vector x (n_var,); None if it violates a
+        bound."""
         low, high, image = self.task.lower, self.task.upper, self.sign * x + self.shift
         inside = (image >= low - MIRROR_TOLERANCE) & (image <= high + MIRROR_TOLERANCE)
         return np.clip(image, low, high) if inside.all() else None
 
 
 def mirror_of(workcell: Workcell) -> Mirror | None:
-    """Return the reflection about the plane between both bases; None if this plane is not upright
-    along a world axis, or the reflection does not map the ends of the path onto themselves."""
+    """Return the reflection about the plane that halves the line between both bases.
+
+    None if the line is not parallel to a horizontal world axis, if the arms have redundant joints,
+    or if the reflection moves the start or the goal of the box.
+    """
     task = workcell.task
     first, second = (robot.T_world_base[:3, 3] for robot in workcell.robots)
     across = np.flatnonzero(np.abs(first - second) > MIRROR_TOLERANCE).tolist()
@@ -185,14 +190,20 @@ def mirror_of(workcell: Workcell) -> Mirror | None:
 
 
 def rotated_starts(task: Task, path: Array, durations: Callable[[Array], Array]) -> list[Array]:
-    """Rotate the box at all waypoints of a path and return the drivable results (n_path,), at most
-    one per axis and direction.
+    """Rotate the box about one axis at all waypoints of a path, and return paths that have a
+    timing.
+
+    For each axis and direction several rotations are tried, by shares of what the bounds allow, and
+    the first one with a timing is kept.
 
     Args:
-        path: (n_path,) original path.
         task: task of the path.
-        durations: function from paths (n, n_path) to durations (n,) [s], infinite for paths without
-            a timing.
+        path: (n_path,) free waypoints.
+        durations: function from paths (n, n_path) to durations (n,) [s], infinite for a path
+            without a timing.
+
+    Returns:
+        Rotated paths (n_path,), at most one per axis and direction.
     """
     found = []
     columns = task.free_entries[1]

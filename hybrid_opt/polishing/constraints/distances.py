@@ -65,8 +65,8 @@ class DistanceConstraintKind(ConstraintKind[PathRow]):
             measured.
         wanted: (n_pairs,) distance that programs require of each pair [m].
         least: (n_pairs,) distance below which a pair violates the constraint [m].
-        separable: indices of the pairs of two boxes, for which gaps along single directions are
-            computed.
+        separable: indices of the pairs of the payload and an obstacle that is a single box, for
+            which gaps along single directions are computed.
     """
 
     window: int = 0
@@ -214,7 +214,7 @@ class Gaps:
     """Gaps of a separable pair along n directions at m places.
 
     Attributes:
-        along: (m, n) gap between both boxes along each direction [m].
+        along: (m, n) gap between payload and obstacle along each direction [m].
         best: (m,) index of the direction with the largest gap.
         height: (m,) largest gap [m], a lower bound of the distance.
     """

@@ -49,7 +49,8 @@ def native() -> Any:
 
 
 class NonlinearProgram(Protocol):
-    """A nonlinear program: minimise cost . z within bounds, with every row nonnegative.
+    """A nonlinear program: minimise cost . z within bounds, with the value of every row
+    nonnegative.
 
     Attributes:
         cost: (n_variables,) gradient of the linear objective.
@@ -62,14 +63,15 @@ class NonlinearProgram(Protocol):
     high: Array
 
     def values(self, z: Array) -> Array:
-        """Return the rows (n_rows,) at z."""
+        """Return the values (n_rows,) of all rows at z (n_variables,)."""
 
     def rows(self, z: Array) -> tuple[Array, Array]:
-        """Return values (n_rows,) and slopes (n_rows, n_variables) at z."""
+        """Return values (n_rows,) and slopes (n_rows, n_variables) of all rows at z
+        (n_variables,)."""
 
     def curvature(self, z: Array, weights: Array) -> Array:
-        """Return the second derivatives (n_variables, n_variables) of the weighted sum of the rows
-        at z."""
+        """Return the Hessian (n_variables, n_variables) of weights . rows at z, for weights
+        (n_rows,)."""
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ class Residuals:
     complementarity: Figure
 
     def scaled(self, unit: float) -> Residuals:
-        """Return the residuals for an objective in a unit that is 1 / `unit` times as large."""
+        """Return the residuals for an objective that is multiplied by `unit`."""
         return Residuals(unit * self.stationarity, self.feasibility, unit * self.complementarity)
 
 
@@ -122,10 +124,12 @@ parameter."""
 def optimality_residuals(
     program: NonlinearProgram, z: Array, bounds: tuple[Array, Array] | None = None
 ) -> Residuals:
-    """Compute optimality residuals at z with least-squares multipliers.
+    """Compute the optimality residuals of a program at z with least-squares multipliers.
 
     Args:
-        bounds: lower and upper bounds (n_variables,); None for the program's.
+        program: the program.
+        z: (n_variables,) variables.
+        bounds: lower and upper bounds (n_variables,) each; None for the program's.
     """
     low, high = bounds or (program.low, program.high)
     rows, slopes = program.rows(z)
@@ -137,13 +141,15 @@ def optimality_residuals(
 def residuals(
     program: NonlinearProgram, z: Array, at_bounds: Array, y: Array, bounds: tuple[Array, Array]
 ) -> Residuals:
-    """Compute residuals of the optimality conditions at z with given multipliers.
+    """Compute the residuals of a program's optimality conditions at z with given multipliers.
 
     Args:
+        program: the program.
+        z: (n_variables,) variables.
         at_bounds: (n_variables,) multipliers of the bounds, positive for upper and negative for
             lower ones.
         y: (n_rows,) multipliers of the rows.
-        bounds: lower and upper bounds (n_variables,) of the variables.
+        bounds: lower and upper bounds (n_variables,) each.
     """
     (low, high), (rows, slopes) = bounds, program.rows(z)
     lagrangian = program.cost - slopes.T @ y + at_bounds
@@ -160,7 +166,7 @@ def estimate_multipliers(
 ) -> tuple[Array, Array]:
     """Estimate multipliers by nonnegative least squares on the optimality conditions.
 
-    After an early stop they are more accurate than the multipliers of the iteration.
+    If a solver stopped early, they are more accurate than the solver's own multipliers.
 
     Args:
         cost: (n,) gradient of the objective.

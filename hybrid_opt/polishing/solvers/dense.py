@@ -35,8 +35,8 @@ def dense(program: NonlinearProgram, iterations: int, barrier: float) -> Answer:
 
     Args:
         program: the program.
-        iterations: wanted number of iterations.
-        barrier: first barrier parameter.
+        iterations: number of iterations after which the solve stops at the next feasible iterate.
+        barrier: first weight of the logarithmic barrier.
 
     Raises:
         BridgeError: the compiled part is missing.

@@ -85,10 +85,18 @@ class _Callback(ca.Callback):  # type: ignore[misc]  # CasADi has no types
 
 
 def _functions(program: NonlinearProgram, wanted: int) -> tuple[_Callback, dict[str, _Callback]]:
-    """Return a program for CasADi's `nlpsol`, and its derivatives with the stopping rule.
+    """Convert a program to the functions that CasADi's `nlpsol` takes.
 
     The solve stops at the first feasible iterate after the wanted number of iterations. Stopped at
     an arbitrary iterate, it usually ends in an obstacle.
+
+    Args:
+        program: the program.
+        wanted: the wanted number of iterations.
+
+    Returns:
+        Objective and rows as one function; derivatives and stopping rule by the names of nlpsol's
+        options.
     """
     n, m, iterations = len(program.start), len(program.values(program.start)), 0
     x, p, g = ca.Sparsity.dense(n), ca.Sparsity(0, 0), ca.Sparsity.dense(m)
@@ -128,8 +136,8 @@ def ipopt(program: NonlinearProgram, iterations: int, barrier: float) -> Answer:
 
     Args:
         program: the program.
-        iterations: wanted number of iterations.
-        barrier: first barrier parameter.
+        iterations: number of iterations after which the solve stops at the next feasible iterate.
+        barrier: first weight of the logarithmic barrier.
     """
     nlp, functions = _functions(program, iterations)
     limits = {"ipopt.mu_init": barrier, "ipopt.max_iter": FEASIBILITY_PATIENCE * iterations}

@@ -50,13 +50,14 @@ Ending = Literal["solved", "infeasible", "failed"]
 
 @dataclass(frozen=True)
 class BorderedMatrix:
-    """A symmetric matrix of a border with k variables and a tridiagonal block, the chain, with n
-    variables.
+    """A symmetric matrix (k + n, k + n) of k border variables followed by n chain variables.
+
+    The block of the chain is tridiagonal.
 
     Attributes:
         corner: (k, k) block of the border.
         beside: (n, k) block that couples chain and border.
-        diagonal, off: (n,) and (n - 1,) diagonal and off-diagonal of the chain.
+        diagonal, off: (n,) diagonal and (n - 1,) off-diagonal of the chain's block.
     """
 
     corner: Array
@@ -65,7 +66,7 @@ class BorderedMatrix:
     off: Array
 
     def plus(self, other: BorderedMatrix, weight: float = 1.0) -> BorderedMatrix:
-        """Return the sum of the matrix and a multiple of another."""
+        """Return this matrix plus `weight` times another one."""
         return BorderedMatrix(
             self.corner + weight * other.corner,
             self.beside + weight * other.beside,
@@ -81,7 +82,7 @@ class BorderedMatrix:
         return BorderedMatrix(corner, self.beside, self.diagonal + by[k:], self.off)
 
     def times(self, d: Array) -> Array:
-        """Multiply the matrix by a vector (k + n,)."""
+        """Return the product (k + n,) of the matrix and a vector d (k + n,)."""
         k = len(self.corner)
         border, chain = d[:k], d[k:]
         product = self.beside @ border + self.diagonal * chain
@@ -103,13 +104,14 @@ class BorderedMatrix:
 
 @dataclass(frozen=True)
 class BorderedRows:
-    """Rows with entries in the border and in at most two neighbouring variables of the chain.
+    """Matrix A (rows, k + n) whose rows have entries in the k border variables and in at most two
+    neighbouring ones of the n chain variables.
 
     Attributes:
         border: (rows, k) entries in the border.
         column: (rows,) index of the first of the two chain variables.
-        left, right: (rows,) entries in these two variables.
-        n_chain: number of variables of the chain.
+        left, right: (rows,) entries in the first and the second of them.
+        n_chain: number n of chain variables.
     """
 
     border: Array
@@ -122,33 +124,37 @@ class BorderedRows:
         return len(self.border)
 
     def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> BorderedRows:
-        """Return the marked rows, or the rows with these indices."""
+        """Return some of the rows.
+
+        Args:
+            chosen: mask (rows,) or indices of these rows.
+        """
         border, left, right = (part[chosen] for part in (self.border, self.left, self.right))
         return BorderedRows(border, self.column[chosen], left, right, self.n_chain)
 
     @cached_property
     def _spread(self) -> sparse.csr_array:
-        """The transposed part (n, rows) of the rows in the chain."""
+        """The transpose (n, rows) of the columns of the chain variables."""
         entries = np.concatenate([self.left, self.right])
         where = np.concatenate([self.column, self.column + 1]), np.tile(np.arange(len(self)), 2)
         return sparse.csr_array((entries, where), shape=(self.n_chain, len(self)))
 
     def times(self, d: Array) -> Array:
-        """Return A d (rows,) of these rows A."""
+        """Return A d (rows,) for a vector d (k + n,)."""
         k = self.border.shape[1]
         border, chain = d[:k], d[k:]
         beside = self.left * chain[self.column] + self.right * chain[self.column + 1]
         return np.asarray(self.border @ border + beside)
 
     def transpose_times(self, y: Array) -> Array:
-        """Return A^T y (k + n,) of these rows A."""
+        """Return A^T y (k + n,) for a vector y (rows,)."""
         n = self.n_chain
         chain = _summed(self.column, self.left * y, n)
         chain += _summed(self.column + 1, self.right * y, n)
         return np.concatenate([y @ self.border, chain])
 
     def squares(self, weight: Array) -> BorderedMatrix:
-        """Return A^T diag(weight) A of these rows A."""
+        """Return the matrix A^T diag(weight) A for weights (rows,)."""
         n, weighted = self.n_chain, self.border * weight[:, None]
         by_left, by_right = weight * self.left, weight * self.right
         diagonal = _summed(self.column, by_left * self.left, n)
@@ -162,17 +168,18 @@ class BorderedRows:
 
 
 def _summed(column: NDArray[np.intp], values: Array, n: int) -> Array:
-    """Sum values that belong to the same of n columns; return the sums (n,)."""
+    """Sum values by column: entry j of the result (n,) is the sum of the values whose column
+    is j."""
     return np.asarray(np.bincount(column, values, n), dtype=float)
 
 
 @dataclass(frozen=True)
 class QuadraticProgram:
-    """The convex quadratic program of the module's formula.
+    """A convex quadratic program: minimise d^T H d / 2 + g . d with A d <= b and low <= d <= high.
 
     Attributes:
-        H, g: matrix and vector of the objective.
-        A, b: matrix and right side of the rows.
+        H, g: matrix and vector (n,) of the objective.
+        A, b: matrix and right side (rows,) of the rows.
         low, high: (n,) bounds of the variables, finite, low < high.
     """
 
@@ -201,7 +208,8 @@ class QuadraticAnswer:
     ending: Ending
 
     def satisfies_optimality(self, program: QuadraticProgram) -> bool:
-        """Return True if the optimality conditions of a program, recomputed here, are satisfied."""
+        """Return True if the answer satisfies the optimality conditions of a program, recomputed
+        here."""
         if not all(np.isfinite(part).all() for part in (self.d, self.rows, self.bounds)):
             return False
         bend, pull = program.H.times(self.d), program.A.transpose_times(self.rows)
@@ -219,11 +227,10 @@ class QuadraticAnswer:
 
 
 def solve_quadratic(program: QuadraticProgram) -> QuadraticAnswer | None:
-    """Solve a program by the own interior-point method. If its result is not optimal, solve by
-    Clarabel.
+    """Solve a program by `solve_interior_point`; if its result is not optimal, solve by Clarabel.
 
     Returns:
-        The result; None if neither finds a solution.
+        The result; None if the program is infeasible or neither method finds a solution.
 
     Raises:
         BridgeError: the compiled part is missing.
@@ -237,8 +244,10 @@ def solve_quadratic(program: QuadraticProgram) -> QuadraticAnswer | None:
 
 
 def solve_interior_point(program: QuadraticProgram) -> QuadraticAnswer:
-    """Solve a program by Mehrotra's method, until the optimality conditions hold or multipliers
-    prove infeasibility."""
+    """Solve a program by Mehrotra's predictor-corrector method.
+
+    The solve ends when the optimality conditions hold, or when multipliers prove infeasibility.
+    """
     return QuadraticAnswer(*native().quadratic(program, QUADRATIC_TOLERANCE))
 
 
@@ -269,18 +278,19 @@ def solve_by_clarabel(program: QuadraticProgram) -> QuadraticAnswer:
 
 
 def convexify(H: BorderedMatrix, A: BorderedRows, b: Array) -> tuple[BorderedMatrix, Array]:
-    """Return a convex model of a Lagrangian that agrees with it where the active rows are
-    equalities.
+    """Return a convex quadratic model of a Lagrangian.
 
-    Squares (A d - b)^2 of the active rows are added until the block of the chain is positive
-    definite. Then negative eigenvalues of the border's Schur complement are raised.
+    The model agrees with the Lagrangian where the active rows are equalities. Squares (A d - b)^2
+    of the active rows are added until the block of the chain is positive definite. Then negative
+    eigenvalues of the border's Schur complement are raised.
 
     Args:
         H: Hessian of the Lagrangian.
-        A, b: active rows A d <= b.
+        A, b: matrix and right side of the active rows A d <= b.
 
     Returns:
-        The positive definite matrix, and the contribution of the squares to the gradient.
+        Positive definite Hessian of the model, and the vector (n,) that the squares add to the
+        gradient.
     """
     scale = max(1e-3, H.largest)
     square, weight = A.squares(np.ones(len(A))), scale
