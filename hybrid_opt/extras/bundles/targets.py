@@ -46,19 +46,20 @@ class Target:
         interpolation: the driver's interpolation between two samples.
         how_to_run: text for the README.
         reaction: text on who carries out a stop; '' for data that is not run.
-        start: text on the common start of both arms.
+        start: text that says who starts both arms at the same time.
         skew: delay between the starts of both arms that a job has to tolerate [s]; None if not
             checked.
         maker: maker of the arms, one of those in `hybrid_opt.extras.bundles.arms`; '' for all.
-        axes: supported numbers of turning joints.
+        axes: numbers of joints per arm that the target supports.
         has_address: True if the target needs the addresses of the controllers.
-        require: function that raises an error for a job that the target cannot run, before it is
-            sampled.
-        require_equipment: function of a cell and the index of the leading arm that raises an error
-            if a driver lacks something.
-        lines: names of the outputs and inputs of hands; None if the target does not switch hands.
+        require: function that raises an error for a job that the target cannot run; it is called
+            before the job is sampled.
+        require_equipment: function of a cell and the index of the leader that raises an error if a
+            driver lacks something.
+        lines: names that are allowed for outputs and inputs of hands; None if the target does not
+            switch hands.
         stiffness: source of the arms' stiffness: 'stated' if the cell has to state it, 'gains' if
-            it follows from the gains in the bundle, '' if the target does not depend on it.
+            it follows from the gains in the bundle, '' if the target needs none.
     """
 
     files: Callable[[Export], Contents]
@@ -109,25 +110,33 @@ class Target:
             self.lines.require(workcell, name)
 
     def stiffness_of(self, job: Job, name: str) -> float | None:
-        """Return the stiffness of each arm at its pad [N/m]; None if the target does not depend on
-        it.
+        """Return the stiffness of each arm at its pad for a job [N/m]; None if the target needs
+        none.
 
-        Both arms hold the box like springs in series, so k_1 and k_2 are averaged to 2 / (1 / k_1 +
-        1 / k_2).
+        Both arms hold the box like springs in series, so their stiffnesses k_1 and k_2 are averaged
+        to 2 / (1 / k_1 + 1 / k_2).
+
+        Args:
+            job: the job.
+            name: name of the target, for messages.
 
         Raises:
-            SettingsError: the target depends on an unknown stiffness.
+            SettingsError: the target needs a stiffness that is unknown.
         """
         if self.stiffness == "gains":
             return pad_stiffness(job)
         return self.stated_stiffness(job.workcell, name)
 
     def stated_stiffness(self, workcell: Workcell, name: str) -> float | None:
-        """Return the stiffness of each arm at its pad that a cell states [N/m]; None if the target
-        does not depend on it.
+        """Return the stiffness of each arm at its pad that a cell states [N/m], averaged as in
+        `stiffness_of`; None if the target needs none.
+
+        Args:
+            workcell: the cell.
+            name: name of the target, for messages.
 
         Raises:
-            SettingsError: the target depends on an unknown stiffness.
+            SettingsError: the target needs a stiffness that is unknown.
         """
         first, second = (robot.driver.stiffness for robot in workcell.robots)
         if first is not None and second is not None:
@@ -342,5 +351,5 @@ def missing_text(name: str, workcell: Workcell) -> str:
 
 
 def targets() -> dict[str, str]:
-    """Return for each target of `export` a text on how to run it, by name."""
+    """Return a text on how to run a bundle, for each target of `export` by name."""
     return {name: target.how_to_run for name, target in TARGETS.items()}

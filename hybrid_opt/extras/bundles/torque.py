@@ -112,10 +112,10 @@ def driver_of(workcell: Workcell) -> str:
 
 
 def require_torque(job: Job) -> None:
-    """Check that franka_ros2 knows the names of the joints, if the arms are Franka's.
+    """Check, for Franka arms, that the names of the joints are those that franka_ros2 uses.
 
     Raises:
-        SettingsError: it does not know the names, or a prefix does not end with '_'.
+        SettingsError: the names differ, or a prefix does not end with '_'.
     """
     if driver_of(job.workcell) != "franka":
         return
@@ -141,11 +141,11 @@ def joint_stiffness(job: Job) -> Array:
 
 
 def pad_stiffness(job: Job) -> float:
-    """Return the stiffness of each arm at its pad along the normal that follows from the gains
-    [N/m].
+    """Compute the stiffness of each arm at its pad along the normal that follows from the joint
+    gains, the largest value along the job [N/m].
 
-    The compliances c_i = n' J K^-1 J' n of both arms act in series: the stiffness is 2 / (c_1 +
-    c_2), the largest value along the job.
+    With normal n, pad Jacobian J and gains K, an arm's compliance is c = n' J K^-1 J' n. Both arms
+    act in series, so the stiffness is 2 / (c_1 + c_2).
     """
     gains, compliance = joint_stiffness(job), np.array([0.0])
     first = len(job.joint_names[0])
@@ -272,9 +272,12 @@ def _controllers(
 
 
 def joint_inertia(job: Job) -> Array:
-    """Return the mean inertia (joints,) about each joint during the job, of arm and tool without
-    the payload: diagonal elements of the joint-space inertia matrix [kg m^2, for sliding joints
-    kg]."""
+    """Compute the mean inertia about each joint during a job, without the payload: the diagonal of
+    the joint-space inertia matrices of arms and tools.
+
+    Returns:
+        (joints,) inertia of all joints, both arms side by side [kg m^2, for sliding joints kg].
+    """
     found, begin = [], 0
     for robot, joints in zip(job.workcell.robots, job.joint_names, strict=True):
         model = build_robot_model(robot).model
@@ -345,8 +348,16 @@ def _franka_type(joints: Sequence[str]) -> str:
 
 
 def _contact(job: Job, arm: int) -> tuple[Array, tuple[float, float]]:
-    """Return the largest values from the contact wrench during the job: torque of each joint
-    (n_joints,) [N m], and force [N] and moment [N m] at the pad."""
+    """Compute the largest loads of an arm by its contact with the box during a job.
+
+    Args:
+        job: the job.
+        arm: index of the arm.
+
+    Returns:
+        Largest torque (n_joints,) of each joint [N m, for sliding joints N]; and largest force [N]
+        and moment [N m] at the pad.
+    """
     first = len(job.joint_names[0])
     span = slice(0, first) if arm == 0 else slice(first, None)
     torque = [np.abs(p.motion.contact_effort(p.force.wrench)[:, span]).max(0) for p in job.phases]

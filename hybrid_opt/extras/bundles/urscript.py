@@ -47,7 +47,7 @@ gives this limit to force_mode."""
 
 
 def require_followed(job: Job) -> None:
-    """Check that a carry moves along its normals no faster than force mode may follow.
+    """Check that the pads move along their normals no faster than URScript's force mode can follow.
 
     Raises:
         SettingsError: the carry is too fast; the message states the speed and remedies.
@@ -181,7 +181,7 @@ def _payload(export: Export, arm: int) -> str:
 
 
 def _pose(T: Array) -> str:
-    """Return a pose in URScript: position [m] and rotation vector [rad]."""
+    """Return a transform T (4, 4) as a pose in URScript: position [m] and rotation vector [rad]."""
     turn = Rotation.from_matrix(T[:3, :3]).as_rotvec()
     return f"p{_list(np.concatenate([T[:3, 3], turn]))}"
 

@@ -36,15 +36,16 @@ MOVE_COST = 0.05
 def common_positions(
     arms: Sequence[ArmKinematics], query: HoldQuery, rng: np.random.Generator
 ) -> Iterator[Array | None]:
-    """Yield positions (2, k) of the common joints at the start and at the goal: first those of
-    locked joints, then others by decreasing score. Yield None once if there are no common joints.
+    """Yield positions of the joints that move both arms, at the start and at the goal (2, k), the
+    most promising first. Yield None once if there are no such joints.
 
-    The score of a position is the share of random postures from which both arms reach the box with
-    it, within joint limits and away from singular postures.
+    The first pair is at zero, as far as the limits allow. A pair is promising if many random
+    postures of either arm reach the box at both ends, within joint limits and away from singular
+    postures, and if the joints move little.
 
     Args:
         arms: both arms.
-        query: the box poses and spins that the arms have to hold.
+        query: box poses at start and goal, and rotations of the pads to try.
         rng: generator of positions and postures.
     """
     if not arms[0].common:
@@ -75,8 +76,19 @@ def common_positions(
 def _reaching(
     arm: ArmKinematics, pose: Array, spins: Array, positions: Array, rng: np.random.Generator
 ) -> Array:
-    """Compute the share (n,) of random postures from which an arm reaches the box pose (6,) with
-    each of the positions (n, k) of the common joints."""
+    """Compute the share of an arm's random postures from which Newton's method reaches the box, for
+    given positions of the joints that move both arms.
+
+    Args:
+        arm: the arm.
+        pose: (6,) pose of the box [m, rad].
+        spins: (s,) rotations of the pad about its normal that are tried [rad].
+        positions: (n, k) positions of the k joints that move both arms [rad or m].
+        rng: generator of random postures.
+
+    Returns:
+        (n,) shares, one for each row of `positions`.
+    """
     T_world_box = box_placement(arm.workcell.task.orientation, pose)
     possible = possible_spins(arm.workcell.contacts[arm.arm], spins)
     targets = np.array([T_world_box @ arm.held(spin) for spin in possible])

@@ -47,12 +47,12 @@ Entry = dict[str, Any]
 
 
 def pattern_entry(entry: Entry, thickness: float) -> Entry:
-    """Return the entry of a contact whose hands are placed relative to the first hand: at the
-    origin, with z into the payload.
+    """Return the entry of a contact with its hands placed relative to the first one, which is at
+    the origin with z into the payload.
 
     Args:
-        entry: entry without `xyz`; the `xyz` of its `further` hands are already relative to the
-            first hand.
+        entry: entry of the contact in the problem file, without `xyz`; `xyz` of the hands in
+            `further` is already relative to the first hand.
         thickness: thickness of the payload, for the opposite finger of a gripper without `further`
             [m].
     """
@@ -66,8 +66,12 @@ def pattern_entry(entry: Entry, thickness: float) -> Entry:
 
 
 def place_entry(contact: Contact, with_normals: bool = False) -> Entry:
-    """Return the keys of a contact's entry that place its hands or pads: `xyz`, `spin`, `further`,
-    and `normal` if wanted."""
+    """Return the keys of a contact's file entry that place its hands or pads on the box: `xyz`,
+    `spin`, `further`, and `normal` if wanted.
+
+    Args:
+        with_normals: True to include `normal`.
+    """
     entries: list[Entry] = []
     for pad in (contact, *contact.further):
         R = pad.T_box_pad[:3, :3]
@@ -85,8 +89,8 @@ def hand_places(
     along: Array,
     workcell: Callable[[list[Entry]], Workcell],
 ) -> list[list[Entry]]:
-    """Return places of both arms' hands on a box, those first that need the least share of the
-    hands' holding force with the payload at rest. Places at which the arms would cross are left
+    """Propose places of both arms' hands on a box. Places come first where the box at rest needs
+    the smallest share of the hands' holding force. Places at which the arms would cross are left
     out.
 
     Args:
@@ -96,6 +100,9 @@ def hand_places(
         rotations: (n, 3, 3) R_world_box at the ends of the carry.
         along: (3,) vector from robot 2 to robot 1 in the box frame; zeros if unknown.
         workcell: function that reads the cell with the given entries of both contacts.
+
+    Returns:
+        For each proposal the file entries of both contacts.
     """
     pairs = [
         (first, second)
@@ -116,7 +123,12 @@ def hand_places(
 
 
 def _with_tools_outside(cell: Workcell, pairs: Sequence[Both]) -> Iterator[Both]:
-    """Yield the pairs of contacts with which no tool enters the payload."""
+    """Yield the pairs of contacts with which no tool enters the payload.
+
+    Args:
+        cell: the cell, whose contacts are replaced.
+        pairs: contacts of both arms.
+    """
     bodies, arms = collision_bodies(cell), [arm_geometry(cell, arm) for arm in (0, 1)]
     T_joint_pad = [
         arm.T_joint_box @ contact.T_box_pad
@@ -131,9 +143,15 @@ def _with_tools_outside(cell: Workcell, pairs: Sequence[Both]) -> Iterator[Both]
 
 
 def _pairs(patterns: Sequence[Contact], size: Array, rotations: Array) -> Iterator[Both]:
-    """Yield pairs of contacts of both arms on faces that are free at both ends of the carry. Cups
+    """Yield contacts of both arms on faces of a box that are free at both ends of the carry. Cups
     and magnets are placed on opposite faces or on one face, fingers around the edges of the
-    thinnest side."""
+    thinnest side.
+
+    Args:
+        patterns: contact of each arm, with its hands placed relative to the first one.
+        size: (3,) edges of the box [m].
+        rotations: (n, 3, 3) R_world_box at the ends of the carry.
+    """
     quarters = np.pi / 2.0 * np.arange(4)
     turned = [rotate_about_normal(pattern, quarters[1]) for pattern in patterns]
     is_same = all(map(covers_the_same, patterns, turned))
@@ -165,11 +183,11 @@ def _placed(
 
     Args:
         pattern: contact with its hands placed relative to the first one.
-        outward: (3,) outward normal of the face.
+        outward: (3,) outward normal of the face in the box frame, along one of its axes.
         size: (3,) edges of the box [m].
-        turn: rotation of the hands about the face's normal [rad].
-        place: (2,) displacement from the centre of the face along the face's axes, over the free
-            distance to the edges.
+        turn: rotation of the hands about the normal of the face [rad].
+        place: (2,) place of the hands on the face between its middle, 0, and its edges, -1 and 1,
+            along the face's two axes.
     """
     face = pad_rotation(-outward, 0.0)
     rotation = face @ pose_matrix(np.zeros(3), np.array([0.0, 0.0, turn]))[:3, :3]
@@ -185,7 +203,7 @@ def _placed(
 
 
 def _reach(pad: Contact) -> Array:
-    """Return half the extent (2,) of a pad's patch along the axes of its contact [m]."""
+    """Compute half the extent (2,) of a pad's patch along the x and y axes of its frame [m]."""
     if pad.half_sides is None:
         return np.full(2, pad.patch_radius)
     return np.asarray(np.abs(pad.T_box_pad[:2, :2]) @ pad.half_sides)
@@ -196,7 +214,7 @@ def _points(contact: Contact) -> Array:
 
 
 def _overlap(one: Contact, other: Contact) -> bool:
-    """Return True if circles around the patches of two contacts intersect."""
+    """Return True if the circles around the patches of two contacts intersect."""
     apart = np.linalg.norm(_points(one)[:, None] - _points(other), axis=2)
     return bool(apart.min() < one.patch_radius + other.patch_radius)
 

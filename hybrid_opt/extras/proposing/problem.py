@@ -47,12 +47,12 @@ DRAFT_ROOM = 0.01
 
 @dataclass(frozen=True)
 class Problem:
-    """The content of a problem file, without the keys that are to be proposed.
+    """Content of a problem file without the keys that a proposal will fill in.
 
     Attributes:
         source: path of the file.
-        text: text of the file without these keys.
-        data: tables of the file without these keys.
+        text: text of the file, without those keys.
+        data: tables of the file, without those keys.
     """
 
     source: Path
@@ -61,8 +61,8 @@ class Problem:
 
     @property
     def poses(self) -> tuple[Array, Array]:
-        """(6,) start and goal of the box [m, rad]. Angles of the goal are on the turn nearest to
-        the start; rotation vectors stay unchanged."""
+        """Poses (6,) of the box at start and goal [m, rad]. Angles of the goal differ by at most
+        half a turn from those of the start; rotation vectors are left unchanged."""
         start, goal = (np.array(self.data["task"][key], dtype=float) for key in ("start", "goal"))
         goal[3:] = self.orientation.unwrapped(np.array([start[3:], goal[3:]]))[1]
         return start, goal
@@ -88,10 +88,12 @@ class Problem:
 
     @cached_property
     def contacts(self) -> list[dict[str, Any]]:
-        """Entries of both contacts with their points on the box: as in the file if it states any.
-        For hands that hold by themselves, the best of `hand_places`. Else the centres of the
-        opposite faces that face the robots, or the shoulders of a machine with two arms; without
-        bases in the file, the faces lateral to the carry.
+        """File entries of both contacts, with their points on the box [m].
+
+        Points in the file are kept. Otherwise hands that hold by themselves are placed at the first
+        of `hand_places`, and pads at the centres of the two opposite faces that face the robots'
+        bases or a machine's shoulders. Without bases in the file, these are the faces beside the
+        direction of the carry.
 
         Raises:
             WorkcellError: the file describes robots whose shoulders cannot be found, or no face has
@@ -128,7 +130,7 @@ class Problem:
 
     @cached_property
     def _hand_places(self) -> list[list[dict[str, Any]]]:
-        """Entries of both contacts for all places of the arms' hands that are considered, the best
+        """File entries of both contacts for each considered placement of the arms' hands, the best
         first."""
         size = np.array(self.data["payload"]["size"], dtype=float)
         thickness, problems = float(size.min()), Problems()
@@ -159,9 +161,12 @@ class Problem:
         return found
 
     def other_contacts(self) -> list[list[dict[str, Any]]]:
-        """Return entries of both contacts for the other places that the pads or hands may take, the
-        most promising first. For pads these are all pairs of opposite faces, upright faces first,
-        then those that face the robots. Empty if the file states the points or has no bases."""
+        """Return file entries of both contacts for other placements of the pads or hands, the most
+        promising first. Empty if the file states the points or has no bases.
+
+        For pads these are all pairs of opposite faces: upright faces first, then those that face
+        the robots.
+        """
         if self._bases is None or all("xyz" in entry for entry in self.data["contacts"]):
             return []
         if self.has_hands:
@@ -178,7 +183,7 @@ class Problem:
         return [pair for pair in pairs if pair != self.contacts]
 
     def _robots(self) -> tuple[Robot, Robot]:
-        """Read the robots without the rest of the file."""
+        """Both robots, read without the rest of the file."""
         problems = Problems()
         entries = TableReader(self.data, "", problems).tables("robots", exactly=2)
         found = [read_robot(entry, self.source.parent)[0] for entry in entries]
@@ -211,9 +216,10 @@ class Problem:
         return found
 
     def workcell(self, changes: dict[str, Any] | None = None) -> Workcell:
-        """Read the workcell. Unless `changes` has waypoints, it gets one free waypoint halfway.
+        """Read the file as a workcell. A task without waypoints gets one free waypoint halfway.
 
-        Reach is not checked: spins and bases are chosen later.
+        Whether the arms reach the box is not checked, because bases and rotations of the pads are
+        chosen later.
 
         Args:
             changes: changes of the file's tables, as `symbolic.read.editing.completed` takes them.
@@ -317,7 +323,8 @@ def _require_known(table: TableReader) -> None:
 def contact_points(
     size: Array, way: Array, R_world_box: Array, bases: Array | None
 ) -> list[list[float]]:
-    """Return the centres of two opposite faces of the box, one facing each robot [m].
+    """Compute the centres (3,) of two opposite faces of the box, in the box frame [m]. The first
+    faces robot 1 and the second faces robot 2.
 
     Args:
         size: (3,) edges of the box [m].

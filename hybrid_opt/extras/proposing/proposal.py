@@ -113,13 +113,14 @@ class ProposeSettings:
     Attributes:
         seconds: time for the whole search [s].
         feasible: smallest and largest wanted share of feasible candidates within the bounds.
-        bases: whether the robots' bases are proposed too. Only their height is then taken from the
-            file.
-        classes: number of carries of different classes to search, as far as the time allows.
-        remedies: whether the least changes are searched with which a box can be held that otherwise
-            cannot.
-        clock: function that counts the seconds; by default it ignores the work of other programs.
-        used: seconds used before, for example by the start of a program.
+        bases: True to propose the robots' bases too; the file then states their heights only.
+        classes: number of carries to find that pass obstacles on different sides or start in other
+            postures, if time allows.
+        remedies: True to search, if the box cannot be held, for the smallest changes of the cell
+            with which it can.
+        clock: function that returns seconds of work; by default the processor time, which does not
+            count other programs.
+        used: seconds spent before the search, for example by the start of a program.
     """
 
     seconds: float = 120.0
@@ -155,7 +156,8 @@ class Proposal:
         seconds: time of the proposal [s].
         certified: time until the first carry was certified, before the search for bounds [s].
         q: joints (n, joints) of each arm at the task's samples [rad or m].
-        sides: for each obstacle of a straight motion, the side on which the carry passes it.
+        sides: for each obstacle of a straight motion the side on which the carry passes it, such as
+            'over post'.
         blocked: obstacle of the pads' approach or retreat; '' if there is none or no time was left
             to check.
     """
@@ -271,7 +273,7 @@ def propose_classes(
 
 @dataclass
 class _Lazy:
-    """A choice of bases whose setup is prepared on first use."""
+    """A choice of bases for a search, prepared when it is first used."""
 
     given: dict[str, Any]
     spins: Array
@@ -340,8 +342,13 @@ class _Search:
         return found
 
     def _takes_all(self, effort: int) -> bool:
-        """Return True if a round uses every choice. Every choice of bases is used; other faces of
-        the box only in late rounds, as long as the faces toward the robots can be held."""
+        """Return True if a round of the search tries every choice. Every choice of bases is tried;
+        other faces of the box only in late rounds, as long as the faces toward the robots can be
+        held.
+
+        Args:
+            effort: number of the round.
+        """
         return self.settings.bases or effort >= OTHER_FACES
 
     def _round(self, lazy: _Lazy, effort: int, most: int, strays: int) -> Iterator[Proposal]:
@@ -515,9 +522,12 @@ class _Search:
         return Trial(workcell, pair.start.q, bodies, named=False)
 
     def _pads_way(self, trial: Trial) -> tuple[str, float | None]:
-        """Return the obstacle of the pads before or after a trial's carry, '' for none, and a
-        stand-off [m] without obstacle, if the cell's stand-off is blocked and the file states
-        none."""
+        """Find what blocks the pads before or after the carry of a trial.
+
+        Returns:
+            The obstacle as text, '' for none; and a free stand-off [m] if the cell's stand-off is
+            blocked and the file states none, else None.
+        """
         handling = trial.workcell.handling
         blocked = grasp_blocked(trial, handling)
         if blocked and "stand_off" not in self.problem.data.get("handling", {}):
@@ -530,7 +540,13 @@ class _Search:
         return self.problem.workcell(changes(self.problem, found))
 
     def _bounds(self, trial: Trial, until: float) -> Bounds:
-        """Find bounds around a trial's carry until `until` seconds after the beginning."""
+        """Find bounds of the decision vector around the carry of a trial.
+
+        Args:
+            trial: the carry, with its evaluator.
+            until: time at which the search has to end, in seconds of the settings' clock since its
+                beginning [s].
+        """
         unit, limits = decision_bounds(trial.workcell)
         low, high = self.settings.feasible
         sampling = Sampling(
@@ -547,6 +563,7 @@ class _Search:
 
 
 def _poses(waypoints: Array) -> Array:
-    """Compute box poses (n, 6) along the spline through waypoints (w, 6 + m)."""
+    """Compute box poses (n, 6) [m, rad] along the spline through waypoints (w, 6 + m), of which the
+    m redundant joints are left out."""
     basis = path_basis(len(waypoints), np.linspace(0.0, 1.0, LEAST_SAMPLES)).position
     return np.asarray((basis @ waypoints)[:, :POSE_SIZE])

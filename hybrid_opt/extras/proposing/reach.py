@@ -84,7 +84,8 @@ def plan_reach(job: Job, q: Array, *, rng: np.random.Generator, after: bool = Fa
 
 
 class _Lines:
-    """Straight lines of both arms' joints, with the box at its place before or after a job."""
+    """Collision checker of straight motions in the joint space of both arms, with the box at its
+    place before or after a job."""
 
     def __init__(self, job: Job, after: bool) -> None:
         end = -1 if after else 0
@@ -99,19 +100,22 @@ class _Lines:
         return np.tile(self._pose, (len(q), 1)), first, second
 
     def touched(self, q: Array) -> str:
-        """Return a text on the collision at joint positions (joints,); '' for none."""
+        """Return a text on the collision at joint positions q (joints,) of both arms side by side;
+        '' for none."""
         touch = self._checker.check(*self._placed(q[None])).first_touch
         return "" if touch is None else str(touch)
 
     def free(self, first: Array, second: Array) -> bool:
-        """Return True if no checked configuration on a line collides."""
+        """Return True if no sampled configuration on the line between two joint positions (joints,)
+        collides."""
         n = int(np.ceil(np.abs(second - first).max() / JOINT_STEP)) + 1
         q = np.linspace(first, second, n + 1)[1:]
         self.looked += len(q)
         return self._checker.check(*self._placed(q)).is_free
 
     def proven(self, first: Array, second: Array) -> bool:
-        """Return True if the whole line is proven free."""
+        """Return True if the whole line between two joint positions (joints,) is proven free of
+        collisions."""
 
         def at(u: Array) -> tuple[Array, Array, Array]:
             return self._placed(first + u[:, None] * (second - first))
@@ -123,7 +127,17 @@ class _Lines:
 def _connected(
     lines: _Lines, q: Array, end: Array, bounds: tuple[Array, Array], seed: int
 ) -> list[Array]:
-    """Find the corners of a path by RRT-Connect.
+    """Find the corners of a path of both arms by the planner RRT-Connect.
+
+    Args:
+        lines: collision checker of straight motions.
+        q: (joints,) joint positions at the beginning [rad or m].
+        end: (joints,) joint positions at the end [rad or m].
+        bounds: lower and upper joint limits (joints,) [rad or m].
+        seed: seed of the planner.
+
+    Returns:
+        Corners (joints,), both ends included.
 
     Raises:
         JobError: RRT-Connect finds no path.
@@ -145,8 +159,13 @@ def _connected(
 
 
 def _shortened(lines: _Lines, corners: list[Array]) -> list[Array]:
-    """Remove corners greedily, as long as the remaining ones can be connected by lines that are
-    proven free."""
+    """Remove corners of a path as long as the remaining ones are connected by lines that are proven
+    free.
+
+    Args:
+        lines: collision checker of straight motions.
+        corners: joint positions (joints,) of both arms [rad or m].
+    """
     found, at = [corners[0]], 0
     while at < len(corners) - 1:
         ahead = range(len(corners) - 1, at + 1, -1)

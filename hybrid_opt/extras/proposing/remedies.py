@@ -35,7 +35,7 @@ class ProblemChange:
 
     Attributes:
         text: description of the change, with a placeholder for the amount in metres.
-        change: function that changes a problem's tables by an amount [m].
+        change: function of a problem, a copy of its tables and an amount [m] that changes the copy.
     """
 
     text: str
@@ -49,8 +49,8 @@ class ProblemChange:
 
 
 def _towards(problem: Problem) -> Array:
-    """Compute the horizontal unit vectors (2, 3) from both bases to the middle of the carry. For a
-    machine with two arms both are the same."""
+    """Compute horizontal unit vectors (2, 3) in the world from each base to the middle of the
+    carry. Both are equal for a machine with two arms."""
     middle = np.mean(problem.poses, axis=0)[:3]
     bases = np.array([robot["base"]["xyz"] for robot in problem.data["robots"]], dtype=float)
     away = (middle - bases) * [1.0, 1.0, 0.0]
@@ -72,7 +72,8 @@ def _raise_bases(problem: Problem, data: Tables, amount: float) -> None:
 
 
 def _lengthen_tools(problem: Problem, data: Tables, amount: float) -> None:
-    """Move the pads along their normals. The bodies of the tools stay in place."""
+    """Move both pads along their normals in the tables `data`, by an amount [m]. The bodies of the
+    tools stay in place."""
     for robot in data["robots"]:
         pad = robot["pad"]
         normal = rotation_from_rpy(pad.get("rpy", [0.0, 0.0, 0.0]))[:, 2]
@@ -99,14 +100,16 @@ PROBLEM_CHANGES = (
 def least_changes(
     problem: Problem, spins: Array, rng: np.random.Generator, is_over: Callable[[], bool]
 ) -> list[tuple[ProblemChange, float]]:
-    """Find kinds of changes and amounts [m] with which both arms can hold the box, the smallest
-    first, each kind once.
+    """Find the smallest change of each kind with which both arms can hold the box.
 
     Args:
         problem: problem whose file states the bases and the pads' places.
-        spins: spins of both pads that are tried [rad].
+        spins: (n,) rotations of the pads about their normals that are tried [rad].
         rng: generator of random postures.
         is_over: function that returns True if the search has to end.
+
+    Returns:
+        Kinds of changes with their amounts [m], the smallest amount first.
     """
     found: dict[ProblemChange, float] = {}
     for amount in AMOUNTS:
@@ -129,7 +132,13 @@ def _can_hold(problem: Problem, spins: Array, rng: np.random.Generator) -> bool:
 def remedies_text(
     problem: Problem, spins: Array, rng: np.random.Generator, is_over: Callable[[], bool]
 ) -> str:
-    """Return a text on the least changes; '' if the file states no bases or none was found."""
+    """Return a text on the smallest changes with which both arms can hold the box; '' if the file
+    states no bases or no change was found.
+
+    Args:
+        spins: (n,) rotations of the pads about their normals that are tried [rad].
+        is_over: function that returns True if the search has to end.
+    """
     robots = problem.data["robots"]
     if not all(
         "xyz" in robot.get("base", {}) and "xyz" in robot.get("pad", {}) for robot in robots

@@ -54,14 +54,14 @@ MOST_POSITIONS = 6
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """A hold of each arm.
+    """A hold of each arm, with which the arms do not collide at start and goal.
 
     Attributes:
         holds: the holds of both arms.
-        start, goal: configuration of the closed chain at both ends.
-        chain: the closed chain, whose collision checker requires as much clearance as both ends
-            have.
-        promise: score; larger is better.
+        start, goal: configurations of arms and box at both ends of the carry.
+        chain: both arms with these holds. Its collision checker requires as much clearance as there
+            is at both ends.
+        promise: score of the pair; larger is better.
     """
 
     holds: tuple[Hold, Hold]
@@ -72,20 +72,20 @@ class Pair:
 
     @cached_property
     def retreats(self) -> Retreats:
-        """Configurations that straight motions out of start and goal reach."""
+        """Configurations that straight collision-free motions out of start and goal reach."""
         return retreats(self.chain, (self.start, self.goal))
 
 
 def ranked_pairs(
     workcell: Workcell, judge: PoseJudge, holds: Sequence[Sequence[Hold]], ends: tuple[Array, Array]
 ) -> list[Pair]:
-    """Return the pairs of holds whose arms do not collide at start and goal, the most promising
-    first.
+    """Combine holds of both arms to pairs in which the arms do not collide at start and goal, the
+    most promising first.
 
     Args:
         workcell: the cell, with chosen redundant joints.
         judge: checker of collisions, without a margin.
-        holds: holds of each arm, with the same positions of common joints.
+        holds: holds of each arm; joints that move both arms have the same positions in all of them.
         ends: start and goal pose (6,) of the box [m, rad].
     """
     scored = [(a.score + b.score, (a, b)) for a in holds[0] for b in holds[1]]
@@ -106,7 +106,14 @@ def ranked_pairs(
 
 
 def _place(task: Task, pose: Array, holds: tuple[Hold, Hold], end: int) -> ChainConfiguration:
-    """Build the configuration of the closed chain at the start (0) or the goal (1)."""
+    """Build the configuration of both arms and the box at the start or the goal.
+
+    Args:
+        task: the task.
+        pose: (6,) pose of the box there [m, rad].
+        holds: hold of each arm.
+        end: 0 for the start, 1 for the goal.
+    """
     joints = [(hold.q_start, hold.q_goal)[end] for hold in holds]
     extended = np.zeros(task.extended_size)
     extended[:POSE_SIZE] = pose
@@ -117,7 +124,7 @@ def _place(task: Task, pose: Array, holds: tuple[Hold, Hold], end: int) -> Chain
 
 
 def _free(judge: PoseJudge, *places: ChainConfiguration) -> bool:
-    """Return True if none of these configurations collides."""
+    """Return True if none of the configurations `places` collides."""
     return not any(
         judge.colliding(place.extended[None, :POSE_SIZE], place.q[0][None], place.q[1][None])[0]
         for place in places
@@ -125,7 +132,14 @@ def _free(judge: PoseJudge, *places: ChainConfiguration) -> bool:
 
 
 def _free_share(chain: ClosedChain, start: ChainConfiguration, goal: ChainConfiguration) -> float:
-    """Compute the share of the most suitable guide that the chain can follow without collision."""
+    """Compute the largest share of a box path from `GUIDES` that both arms can follow without
+    collision, from start and goal together.
+
+    Args:
+        chain: both arms with a fixed hold each.
+        start: configuration at the start.
+        goal: configuration at the goal.
+    """
     best = 0.0
     for bow in GUIDES[:RANKING_GUIDES]:
         path = initial_arc(start.extended, goal.extended, bow)
@@ -180,10 +194,10 @@ def prepare(
 
     Args:
         problem: the problem.
-        given: additions to the problem's tables, such as bases.
+        given: additions to the problem's tables that were chosen before, such as bases.
         spins: (n,) rotations of the pads about their normals that are tried [rad].
         rng: random generator.
-        tell: function that is called with the text of the grip budget before the search.
+        tell: function that is called before the search with a text on the cell's grip budget.
 
     Raises:
         ProposalError: an arm cannot hold the box at start and goal; the message says why.
@@ -219,13 +233,26 @@ def prepare(
 
 
 def _progress(searches: Sequence[HoldSearch]) -> tuple[float, ...]:
-    """Return a key to compare searches for holds by: how far the less successful arm got."""
+    """Return a key by which results of the search for holds are compared: larger if the less
+    successful arm got farther.
+
+    Args:
+        searches: result for each arm.
+    """
     return min((len(one.holds), one.kept, one.free, one.within) for one in searches)
 
 
 def redundancy(problem: Problem, workcell: Workcell) -> dict[str, Any]:
-    """Return the table entries that declare joints redundant: those of arms with more than six
-    joints, except joints that the file names. They start at the middle of their ranges."""
+    """Choose the redundant joints of arms with more than six joints, unless the file names them.
+    They start at the middle of their ranges.
+
+    Args:
+        problem: the problem.
+        workcell: its cell.
+
+    Returns:
+        Additions to the tables `robots` and `task` of the problem.
+    """
     robots: list[dict[str, Any]] = [{}, {}]
     entries: dict[str, dict[str, Any]] = {}
     common = common_joints(workcell.robots)
@@ -247,9 +274,18 @@ def redundancy(problem: Problem, workcell: Workcell) -> dict[str, Any]:
 
 
 def redundant_joints(workcell: Workcell, arm: int, common: tuple[str, ...]) -> tuple[int, ...]:
-    """Return the indices of the joints of an arm that should be redundant: the choice with which
-    the other six joints are best conditioned, in the median of random postures. Joints that move
-    both arms and sliding joints are always included."""
+    """Choose the redundant joints of an arm such that the other six are best conditioned: the
+    smallest singular value of their Jacobian is largest, in the median of random postures. Joints
+    that move both arms and sliding joints are chosen first.
+
+    Args:
+        workcell: the cell.
+        arm: index of the arm.
+        common: names of the joints that move both arms.
+
+    Returns:
+        Indices of the chosen joints.
+    """
     robot = workcell.robots[arm]
     model = arm_model(robot)
     names, beyond = list(model.names)[1:], model.nq - FOLLOWING
@@ -270,7 +306,12 @@ def redundant_joints(workcell: Workcell, arm: int, common: tuple[str, ...]) -> t
 
 
 def box_blocked(judge: PoseJudge, start: Array, goal: Array) -> str:
-    """Return a text on the obstacle of the box alone at the start or the goal; '' for none."""
+    """Return a text on the bodies that the box meets at start or goal, arms left out; '' for none.
+
+    Args:
+        start: (6,) pose of the box at the start [m, rad].
+        goal: (6,) pose of the box at the goal [m, rad].
+    """
     found = []
     for name, pose in (("start", start), ("goal", goal)):
         for body, deep in judge.resting(pose):
@@ -281,8 +322,8 @@ def box_blocked(judge: PoseJudge, start: Array, goal: Array) -> str:
 
 
 def reach_missing(workcell: Workcell, ends: tuple[Array, Array], spins: Array) -> str:
-    """Return a text that says which arm cannot reach its contact, at which end, and by which
-    distance; '' if both arms reach with some spin.
+    """Return a text on the arms that cannot reach their contacts at start or goal, and on the
+    missing distance; '' if both arms reach with some rotation of their pads.
 
     Args:
         workcell: the cell.
@@ -362,8 +403,13 @@ def _no_pair(query: HoldQuery, judge: PoseJudge, searches: Sequence[HoldSearch])
 
 
 def no_path(pairs: Iterable[Pair], refusals: Sequence[str]) -> str:
-    """Return a text on the most frequent obstacle of the planner, and on the reasons why the
-    evaluator refused its paths."""
+    """Return a text on why no path was found: the planner's most frequent obstacle, and the
+    evaluator's reasons to refuse paths.
+
+    Args:
+        pairs: pairs of holds with which paths were searched.
+        refusals: reasons of the evaluator.
+    """
     met: Counter[tuple[str, str]] = Counter()
     refused: Counter[str] = Counter()
     for pair in pairs:
@@ -389,8 +435,11 @@ def _pairs(met: Counter[tuple[str, str]]) -> str:
 
 
 def _overlap_hint(met: Counter[tuple[str, str]]) -> str:
-    """Return a remedy for links of one robot that collide in every posture; '' if there are
-    none."""
+    """Return a remedy for links of one robot that collide in every posture; '' if there are none.
+
+    Args:
+        met: number of collisions by pair of bodies.
+    """
     owners = [[name.partition("/")[0] for name in pair if "/" in name] for pair in met]
     if not any(len(names) == 2 and names[0] == names[1] for names in owners):
         return ""

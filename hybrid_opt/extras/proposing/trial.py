@@ -49,7 +49,7 @@ LEVEL = 0.1
 
 
 class PayloadSceneChecker:
-    """Collision checker of the box in the environment, without the arms."""
+    """Collision checker of the box and the environment, without the arms."""
 
     def __init__(self, workcell: Workcell) -> None:
         """Prepare the shapes of box and environment."""
@@ -63,25 +63,38 @@ class PayloadSceneChecker:
         ]
 
     def meets(self, path: Array) -> bool:
-        """Return True if the box meets the environment at one of these poses (n, 6)."""
+        """Return True if the box collides with a body of the environment at one of these poses.
+
+        Args:
+            path: (n, 6) poses of the box [m, rad].
+        """
         return any(
             self._meets(box, k) for box in self._boxes(path) for k in range(len(self._names))
         )
 
     def is_between(self, begin: Array, end: Array, shares: Array) -> bool:
-        """Return True if the box meets the environment at shares (n,) of the straight motion
-        between two poses (6,). Results are cached, because all holds share these motions."""
+        """Return True if the box collides with a body of the environment on a straight motion.
+        Results are cached by the ends of the motion.
+
+        Args:
+            begin, end: (6,) box poses at the ends [m, rad].
+            shares: (n,) places on the motion that are checked, in [0, 1].
+        """
         key = begin.tobytes(), end.tobytes()
         if key not in self._met:
             self._met[key] = self.meets(begin + shares[:, None] * (end - begin))
         return self._met[key]
 
     def sides_passed(self, path: Array) -> tuple[str, ...]:
-        """Return the sides on which a path (n, 6) passes the obstacles of the straight motion
-        between its ends, such as 'over post', 'left of post' (looking along the motion), 'between
-        post and wall' or 'through frame'. The result is empty if the straight motion is free.
+        """Return on which sides a path of the box passes the obstacles of the straight motion
+        between its ends. Bodies that the box touches at an end, such as its support, do not count.
 
-        Bodies that the box touches at an end, such as its support, do not count.
+        Args:
+            path: (n, 6) poses of the box [m, rad].
+
+        Returns:
+            Texts such as 'over post', 'left of post' (looking along the motion), 'between post and
+            wall' or 'through frame'; empty if the straight motion is free.
         """
         n = max(int(np.ceil(np.linalg.norm(path[-1, :3] - path[0, :3]) / CONTACT_STEP)), 2)
         straight = self._boxes(np.linspace(path[0], path[-1], n + 1))
@@ -109,9 +122,15 @@ class PayloadSceneChecker:
 def _passage(
     boxes: list[tuple[Piece, ...]], standing: Mapping[str, tuple[Piece, ...]], name: str, way: Array
 ) -> str:
-    """Return a text on how a box passes a fixed body while beside it: the side with the largest
-    gap, across the direction of motion `way` (3,), and whether the box is between parts of the body
-    or between the body and another one."""
+    """Return a text on how the box passes a fixed body: the side with the largest gap while the box
+    is beside it, or whether the box is between parts of this body or between it and another one.
+
+    Args:
+        boxes: solids of the box at each pose of the path.
+        standing: solids of each fixed body by name.
+        name: name of the body that is passed.
+        way: (3,) displacement of the box from start to goal in the world [m].
+    """
     length = float(np.linalg.norm(way))
     along = way / length if length > 0.0 else np.array([1.0, 0.0, 0.0])
     level = np.array([along[0], along[1], 0.0])
@@ -127,7 +146,8 @@ def _passage(
     abreast = min(boxes, key=lambda box: abs(_reach(box, along) - _reach(box, -along) - middle))
 
     def faces(other: tuple[Piece, ...], side: Array) -> bool:
-        """Return True if the box meets the other body when it moves to this side."""
+        """Return True if the box would meet the body `other` if it moved in the direction `side`
+        (3,)."""
         across = along, np.cross(along, side)
         return any(
             _gap(abreast, (piece,), side) >= 0.0
@@ -150,28 +170,29 @@ def _passage(
 
 
 def _gap(box: tuple[Piece, ...], body: tuple[Piece, ...], direction: Array) -> float:
-    """Compute how far a box may move in a direction (3,) before it is beside a body [m]; negative
-    if it already is."""
+    """Compute how far a box may move along a direction (3,) until it would meet the extent of a
+    body in this direction [m]; negative if the extents overlap."""
     return -_reach(body, -direction) - _reach(box, direction)
 
 
 def _reach(pieces: tuple[Piece, ...], direction: Array) -> float:
-    """Compute the largest coordinate of pieces along a direction (3,) [m]."""
+    """Compute the largest coordinate of solids along a direction (3,) in the world [m]."""
     return max(float(support(piece, direction)[0]) for piece in pieces)
 
 
 class PoseJudge:
-    """Collision checker of configurations, with a clearance margin.
+    """Collision checker of box poses and joint positions, with a clearance margin.
 
     Attributes:
-        geometry: the cell's bodies and pairs.
-        margin: a smaller clearance than this beyond the cell's tolerance counts as a collision [m].
-        checker: the collision checker.
-        met: number of collisions by pair since the counter was cleared.
+        geometry: the cell's bodies and the pairs of them that are checked.
+        margin: additional clearance, beyond the cell's tolerance, below which bodies count as
+            colliding [m].
+        checker: collision checker with this clearance.
+        met: number of collisions by pair of bodies since this counter was cleared.
     """
 
     def __init__(self, geometry: CellGeometry, checker: CollisionChecker, margin: float) -> None:
-        """Store the parts. Use `judge_of` to build a checker for a cell."""
+        """Store the attributes. Use `judge_of` to build a checker for a cell."""
         self.geometry = geometry
         self.margin = margin
         self.met: Counter[tuple[str, str]] = Counter()
@@ -199,14 +220,32 @@ class PoseJudge:
         return PoseJudge(geometry, checker, margin)
 
     def colliding(self, pose: Array, q_1: Array, q_2: Array) -> NDArray[np.bool_]:
-        """Return (n,) True for colliding box poses (n, 6) and both arms' joints (n, joints)."""
+        """Find configurations of both arms and the box that collide.
+
+        Args:
+            pose: (n, 6) box poses [m, rad].
+            q_1: (n, joints) joint positions of the first arm [rad or m].
+            q_2: (n, joints) joint positions of the second arm [rad or m].
+
+        Returns:
+            (n,) True for configurations that collide.
+        """
         found = self.checker.check(pose, q_1, q_2)
         if found.first_touch is not None:
             self.met[found.first_touch.first, found.first_touch.second] += 1
         return found.colliding
 
     def arm_colliding(self, arm: int, pose: Array, q: Array) -> NDArray[np.bool_]:
-        """Return (n,) True for collisions of one arm and the box. The other arm is left out."""
+        """Find configurations of one arm and the box that collide. The other arm is left out.
+
+        Args:
+            arm: index of the arm.
+            pose: (n, 6) box poses [m, rad].
+            q: (n, joints) joint positions of the arm [rad or m].
+
+        Returns:
+            (n,) True for configurations that collide.
+        """
         absent = np.zeros((len(q), self.geometry.arms[1 - arm].joints))
         q_1, q_2 = (q, absent) if arm == 0 else (absent, q)
         bounds = self.checker.bounds(pose, q_1, q_2)
@@ -214,8 +253,12 @@ class PoseJudge:
         return self.checker.check(pose, q_1, q_2, bounds).colliding
 
     def resting(self, pose: Array) -> list[tuple[str, bool]]:
-        """Return the environment bodies that the box touches at a pose (6,), and for each True if
-        the box penetrates it deeper than a resting box may."""
+        """Find the bodies of the environment that the box touches at a pose (6,) [m, rad].
+
+        Returns:
+            Names of the bodies, each with True if the box penetrates it deeper than a resting box
+            may.
+        """
         names = [
             (k, pair) for k, pair in enumerate(self.geometry.pair_names) if PAYLOAD_NAME in pair
         ]
@@ -234,7 +277,15 @@ class PoseJudge:
     def first_pair(
         self, pose: Array, q_1: Array, q_2: Array, arm: int | None = None
     ) -> tuple[str, str] | None:
-        """Return the first pair that collides in one configuration, of one arm or of all."""
+        """Return the names of the first pair of bodies that collides in a configuration; None if
+        none does.
+
+        Args:
+            pose: (6,) box pose [m, rad].
+            q_1: (joints,) joint positions of the first arm [rad or m].
+            q_2: (joints,) joint positions of the second arm [rad or m].
+            arm: index of the only arm that counts; None for both.
+        """
         pose, q_1, q_2 = (np.atleast_2d(part) for part in (pose, q_1, q_2))
         bounds = self.checker.bounds(pose, q_1, q_2)
         if arm is not None:
@@ -268,11 +319,11 @@ CHUNK = 32
 
 
 class Trial:
-    """Evaluator of a proposed workcell that needs no compiler.
+    """Evaluator of a proposed cell that interprets its functions in place of compiling them.
 
     Attributes:
         workcell: the cell, with the start branches that were found.
-        branches: start branch of each robot among the ranked branches.
+        branches: index of each robot's start branch among its ranked branches.
         bodies: arms and bodies of the cell, which do not depend on the carry.
         model: symbolic model of the cell.
         evaluator: evaluator of candidates.
@@ -329,10 +380,10 @@ class Trial:
         return outputs["q_1"][0, 0], outputs["q_2"][0, 0]
 
     def verdict(self) -> tuple[Judgement, str]:
-        """Evaluate the proposed carry on its samples, between them, and at rest at both ends.
+        """Evaluate the proposed carry at its samples, between them, and at rest at both ends.
 
         Returns:
-            The verdict, and the reason of a failure, else ''.
+            The verdict; and the reason if the carry is not feasible, else ''.
         """
         judgement, why = self.verdict_on(self.initial)
         told = (
@@ -343,15 +394,15 @@ class Trial:
         )
 
     def certain(self, x: Array) -> bool:
-        """Return True if a decision vector x (n_var,) is feasible on its samples and between
-        them."""
+        """Return True if the carry of a decision vector x (n_var,) is feasible at its samples and
+        between them."""
         return bool(self.feasible(x[None])[0]) and self.verdict_on(x)[0].feasible
 
     def verdict_on(self, x: Array) -> tuple[Judgement, str]:
-        """Evaluate a decision vector x (n_var,) on its samples and between them.
+        """Evaluate the carry of a decision vector x (n_var,) at its samples and between them.
 
         Returns:
-            The verdict, and the reason of a failure, else ''.
+            The verdict; and the reason if the carry is not feasible, else ''.
         """
         verdicts = self.evaluator.evaluate(x[None])
         judgement = verdicts.judgement(0, self.evaluator.objective_names)
@@ -367,8 +418,11 @@ class Trial:
         return replace(judgement, feasible=False, reason="between_samples"), place
 
     def feasible(self, x: Array) -> NDArray[np.bool_]:
-        """Return (n,) True for decision vectors (n, n_var) that are feasible on the task's
-        samples."""
+        """Find decision vectors x (n, n_var) whose carries are feasible at all samples of the task.
+
+        Returns:
+            (n,) True for feasible ones.
+        """
         parts = [self._feasible(x[k : k + CHUNK]) for k in range(0, len(x), CHUNK)]
         return np.concatenate(parts)
 
@@ -382,7 +436,11 @@ class Trial:
         return fine
 
     def _collides(self, placed: list[Array]) -> bool:
-        """Return True if a carry collides at a sample."""
+        """Return True if a carry collides at a sample.
+
+        Args:
+            placed: box poses (n, 6) and joint positions (n, joints) of both arms, at n samples.
+        """
         last = len(placed[0]) - 1
         coarse = np.arange(last, -1, -COARSE)
         return self._hit(placed, coarse) or self._hit(
@@ -390,8 +448,13 @@ class Trial:
         )
 
     def _hit(self, placed: list[Array], rows: NDArray[np.intp]) -> bool:
-        """Return True if one of these samples collides. Samples with the smallest distance bounds
-        are checked first."""
+        """Return True if a carry collides at one of the given samples. Those with the smallest
+        bounds of clearance are checked first.
+
+        Args:
+            placed: box poses (n, 6) and joint positions (n, joints) of both arms, at n samples.
+            rows: indices of the samples.
+        """
         checker = self.evaluator.checker
         pose, q_1, q_2 = (np.ascontiguousarray(values[rows]) for values in placed)
         bounds = checker.bounds(pose, q_1, q_2)
@@ -403,8 +466,14 @@ class Trial:
 
 
 def _satisfied(outputs: dict[str, Array]) -> NDArray[np.bool_]:
-    """Return (n,) True for candidates that satisfy all constraints except collisions at every
-    sample."""
+    """Find candidates that satisfy all constraints except freedom from collisions.
+
+    Args:
+        outputs: outputs of the evaluator's functions for n candidates, by name.
+
+    Returns:
+        (n,) True for such candidates.
+    """
     finite = np.isfinite(outputs["time"]).all(axis=tuple(range(1, outputs["time"].ndim)))
     return np.asarray(np.all(outputs["violation"] <= 0.0, axis=1) & finite)
 
@@ -426,9 +495,9 @@ def _branch(branches: tuple[StartBranch, ...], q: Array) -> int:
 
 
 def grasp_blocked(trial: Trial, handling: Handling) -> str:
-    """Return a text on the obstacle of the pads' approach before a trial's carry or of their
-    retreat after it, lift and set-down included; '' for none, or if there are no jobs for such
-    pads."""
+    """Return a text on what blocks the pads before or after a trial's carry: at their approach, the
+    lift, the set-down or their retreat. It is '' if nothing does, or if no jobs are planned for
+    such pads."""
     cell = replace(trial.workcell, handling=handling)
     if not cell.has_facing_pads:
         return ""

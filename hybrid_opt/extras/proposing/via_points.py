@@ -59,12 +59,14 @@ def path_length(points: Array) -> float:
 
 
 def joint_length(places: Sequence[ChainConfiguration]) -> float:
-    """Compute the Euclidean length of the path of all joints through configurations [rad]."""
+    """Compute the Euclidean length of the path in the joint space of both arms through
+    configurations [rad]."""
     return path_length(np.array([np.concatenate(place.q) for place in places]))
 
 
 def along(corners: Sequence[ChainConfiguration]) -> Array:
-    """Compute box poses (n, 6) on the straight motions between corners."""
+    """Compute box poses (n, 6) [m, rad] on the straight motions between successive corners of a
+    path."""
     legs = [straight(a.extended, b.extended)[:, :POSE_SIZE] for a, b in pairwise(corners)]
     return np.vstack(legs)
 
@@ -72,8 +74,16 @@ def along(corners: Sequence[ChainConfiguration]) -> Array:
 def remove_corners(
     chain: ClosedChain, corners: Sequence[ChainConfiguration], rng: np.random.Generator
 ) -> list[ChainConfiguration]:
-    """Remove needless corners of a path. Return configurations along it that are
-    `planner.PATH_STEP` apart."""
+    """Shorten a path by straight motions between random places on it.
+
+    Args:
+        chain: both arms with a fixed hold each.
+        corners: corners of a collision-free path.
+        rng: generator of the places.
+
+    Returns:
+        Configurations along the path, at most `planner.PATH_STEP` apart.
+    """
     dense = [corners[0]]
     for corner in corners[1:]:
         found = chain.way(dense[-1], straight(dense[-1].extended, corner.extended))
@@ -98,16 +108,20 @@ def remove_corners(
 def fit(
     chain: ClosedChain, path: Sequence[ChainConfiguration], count: int, rng: np.random.Generator
 ) -> Array | None:
-    """Find via-points (count, 6 + m) whose spline is free; None if none are found.
+    """Find via-points whose spline from start to goal is free of collisions; None if none are
+    found.
 
-    Tried are via-points on the path at even distances, those whose spline is nearest to the path,
-    interpolations between both, and random shifts of the best.
+    Tried are points on the path at even distances, the points whose spline is nearest to the path,
+    interpolations between these two, and random shifts of the best.
 
     Args:
-        chain: both arms with one pair of holds.
+        chain: both arms with a fixed hold each.
         path: configurations from start to goal.
         count: number of via-points.
         rng: generator of the shifts.
+
+    Returns:
+        (count, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
     """
     points = np.array([place.extended for place in path])
     steps = [distance(a, b) for a, b in pairwise(points)]
@@ -142,9 +156,19 @@ def fit(
 def shorten_spline(
     chain: ClosedChain, start: ChainConfiguration, waypoints: Array, rng: np.random.Generator
 ) -> Array:
-    """Find waypoints (n, 6 + m) of a free spline with shorter joint paths than a given free spline.
+    """Change waypoints such that their spline stays free of collisions and the paths of the joints
+    become shorter.
 
     An evolution strategy, CMA-ES (Hansen, arXiv 1604.00772), starts from the given waypoints.
+
+    Args:
+        chain: both arms with a fixed hold each.
+        start: configuration at the first waypoint.
+        waypoints: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m],
+            start and goal included.
+
+    Returns:
+        (n, 6 + m) waypoints; the given ones if none better are found.
     """
     # Not imported at the top: it brings Matplotlib, and a first carry is there before.
     import cma
@@ -182,8 +206,14 @@ def shorten_spline(
 def _closed_path(
     chain: ClosedChain, start: ChainConfiguration, path: Array
 ) -> Iterator[ChainConfiguration]:
-    """Yield configurations along extended poses (n, 6 + m) as long as the chain closes. Collisions
-    are ignored."""
+    """Yield configurations along a path, up to the first pose at which an arm cannot hold the box.
+    Collisions are ignored.
+
+    Args:
+        chain: both arms with a fixed hold each.
+        start: configuration at the first pose.
+        path: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
+    """
     place: ChainConfiguration | None = start
     yield start
     for extended in path[1:]:
@@ -195,9 +225,19 @@ def _closed_path(
 
 
 def _lengths(chain: ClosedChain, paths: Array, near: tuple[Array, Array]) -> tuple[Array, Array]:
-    """Compute the joint path lengths (k,) [rad] along paths (k, n, 6 + m), with postures near those
-    of a closed path, (n, joints) for each arm; and an additional cost (k,) above 0 for blocked
-    paths."""
+    """Compute the length of k paths in the joint space of both arms, and a cost of their blocked
+    parts.
+
+    Args:
+        chain: both arms with a fixed hold each.
+        paths: (k, n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
+        near: joint positions (n, joints) of each arm along a similar path, from which the solution
+            starts [rad or m].
+
+    Returns:
+        Lengths (k,) [rad], and costs (k,) [rad] that are 0 for paths without collisions whose every
+        pose both arms can hold.
+    """
     k, n, size = paths.shape
     begin = np.tile(near[0], (k, 1)), np.tile(near[1], (k, 1))
     flat = paths.reshape(-1, size)
@@ -211,8 +251,14 @@ def _lengths(chain: ClosedChain, paths: Array, near: tuple[Array, Array]) -> tup
 
 
 def free_share(chain: ClosedChain, start: ChainConfiguration, waypoints: Array) -> float:
-    """Compute the share of the spline through waypoints (n, 6 + m) that is free, before its first
-    collision."""
+    """Compute the share of a spline before its first collision, or the first pose at which an arm
+    cannot hold the box.
+
+    Args:
+        chain: both arms with a fixed hold each.
+        start: configuration at the first waypoint.
+        waypoints: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
+    """
     legs = [distance(a, b) for a, b in pairwise(waypoints)]
     n = max(LEAST_SAMPLES, int(np.ceil(1.2 * sum(legs) / PATH_STEP)))
     path = path_basis(len(waypoints), np.linspace(0.0, 1.0, n)).position @ waypoints

@@ -27,7 +27,8 @@ def generate_launch_description() -> Any:
 
 
 def actions(each: dict[str, Any]) -> list[Any]:
-    """Return a driver's launch file or a description, a controller manager, and its controllers."""
+    """Return the launch actions of one entry: a driver's launch file or a robot description, a
+    controller manager, and its controllers."""
     parameters: list[Any] = [str(BUNDLE / name) for name in each["parameters"]]
     outside, inside = list[Any](), list[Any]()
     if each["namespace"]:

@@ -69,22 +69,26 @@ CTRL_C = "Ctrl-C"
 
 
 class Press:
-    """Controls the position of the pressing pad along its normal by the force.
+    """Controller of the pressing pad's position along its normal that adjusts the normal force.
 
     Attributes:
         way: distance beyond the planned position, into the box [m].
     """
 
     def __init__(self, config: dict[str, Any]) -> None:
-        """Start at the planned position."""
+        """Start at the planned position.
+
+        Args:
+            config: settings `gain`, `most`, `speed` and `compliance` of the bundle.
+        """
         self.way = 0.0
         self._missing = 0.0
         self._gain, self._most = config["gain"], config["most"]
         self._speed, self._compliance = config["speed"], config["compliance"]
 
     def tick(self, dt: float, wanted: float, soon: float, felt: float | None) -> None:
-        """Move the pad for one time step, by changing `way`, so that it presses with the commanded
-        force.
+        """Move the pad for one time step, by changing `way`, so that the normal force approaches
+        the commanded one.
 
         The pad moves to the depth at which the arms' compliance gives the force, corrected by the
         integral of the measured error. Its speed and depth are bounded.
@@ -92,8 +96,8 @@ class Press:
         Args:
             dt: time step [s].
             wanted: commanded normal force now [N].
-            soon: commanded normal force after the arm's lag [N].
-            felt: measured force [N]; None before the first measurement.
+            soon: commanded normal force one delay of the arm later [N].
+            felt: measured normal force [N]; None before the first measurement.
         """
         if wanted <= 0.0:
             self._missing = 0.0
@@ -107,8 +111,14 @@ class Press:
         self._move(target, self._speed * dt)
 
     def creep(self, dt: float, wanted: float, felt: float) -> None:
-        """Advance the time by dt [s] for an arm of unknown stiffness: the pad moves at a constant
-        speed in the direction that reduces the error of the force."""
+        """Move the pad for one time step at a constant low speed, in the direction that reduces the
+        error of the force, to measure an unknown stiffness.
+
+        Args:
+            dt: time step [s].
+            wanted: commanded normal force [N].
+            felt: measured normal force [N].
+        """
         self._move(self._most if felt < wanted else 0.0, CREEP * dt)
 
     def _move(self, target: float, step: float) -> None:
@@ -116,7 +126,8 @@ class Press:
 
 
 class Stream:
-    """Answers the messages of both controllers."""
+    """The control of both arms by EGM: it answers each message of a controller with a commanded
+    position."""
 
     def __init__(self, job: Job, config: dict[str, Any], known: Sequence[Measured] | Looks) -> None:
         """Prepare to wait for both controllers.
@@ -164,7 +175,8 @@ class Stream:
         return Seen(q=q, force=force, age=age, fault=self.fault, lost=lost)
 
     def hear(self, arm: int, message: FromRobot, now: float) -> None:
-        """Process a message of an arm's controller that arrived at time `now` [s]."""
+        """Store the measured state in a message from an arm's controller that arrived at the time
+        `now` [s]."""
         degrees = self._in_chain(arm, message.joints, message.further)
         if degrees is None:
             return
@@ -189,8 +201,14 @@ class Stream:
         return "" if all(self._follows) else self._not_following(self._follows.index(False))
 
     def read(self, arm: int, data: bytes, host: str) -> FromRobot | None:
-        """Decode a packet. Return None for a damaged packet or one from another host, and count
-        it."""
+        """Decode a packet from an arm's controller. Return None, and count the packet, if it is
+        damaged or comes from another host.
+
+        Args:
+            arm: index of the arm.
+            data: content of the packet.
+            host: address of the sender.
+        """
         if host == self._hosts[arm]:
             with suppress(ValueError, struct.error):
                 return read_robot(data)
@@ -198,7 +216,7 @@ class Stream:
         return None
 
     def told(self) -> str:
-        """Return a text on the state."""
+        """Return a text that says in which state the job is."""
         strange = f" {self.dropped} packets were dropped, from other hosts or damaged."
         return self.machine.told() + (strange if self.dropped else "")
 
@@ -244,8 +262,14 @@ class Stream:
             print(self.told(), file=sys.stderr)
 
     def answer(self, arm: int, number: int, now: float) -> bytes:
-        """Return the message with an arm's commanded position, taken ahead of the clock by the
-        arm's lag."""
+        """Encode the message that commands an arm's position, taken from the path ahead by the
+        arm's delay.
+
+        Args:
+            arm: index of the arm.
+            number: number of the message.
+            now: time [s].
+        """
         clock, first = self.machine.clock, self._first[arm]
         if self.machine.state == "ready" and first is not None:
             q = first
@@ -259,8 +283,8 @@ class Stream:
         return to_robot(number, now, joints, further)
 
     def _inward(self, s: float) -> list[float]:
-        """Return the motion of each joint per motion of the pressing pad along its normal
-        [rad/m]."""
+        """Compute the motion of each joint of the pressing arm per motion of its pad along the
+        normal, at a coordinate s [s] of the job [rad/m]."""
         rows, time = self.config["inward"], self.job.time
         k = min(max(bisect_left(time, s) - 1, 0), len(rows) - 2)
         share = min(max((s - time[k]) / (time[k + 1] - time[k]), 0.0), 1.0)
@@ -269,8 +293,14 @@ class Stream:
     def _in_chain(
         self, arm: int, joints: Sequence[float], further: Sequence[float]
     ) -> list[float] | None:
-        """Return axes in the order of the kinematic chain [degrees]. ABB counts the third of seven
-        as an external axis."""
+        """Return an arm's joint positions in the order of its joints, base first [degrees]; None if
+        their number is wrong. ABB counts the third of seven joints as an external axis.
+
+        Args:
+            arm: index of the arm.
+            joints: positions of the robot's axes in a message [degrees].
+            further: positions of the external axes in the message [degrees].
+        """
         count = len(self.job.robots[arm]["joints"])
         if len(joints) < 6 or (count == 7 and not further):
             return None
@@ -373,7 +403,7 @@ def streamed(
 
 
 def received(source: socket.socket) -> Iterator[tuple[bytes, Any]]:
-    """Yield the packets that wait in a socket, each with its sender's address."""
+    """Yield the packets that wait in a socket, each as content and address of the sender."""
     with suppress(BlockingIOError):
         while True:
             yield source.recvfrom(4096, socket.MSG_DONTWAIT)
@@ -391,9 +421,9 @@ class FromRobot:
     """A message from a controller.
 
     Attributes:
-        number: of the message.
-        joints, further: axes of the robot, and external axes [degrees].
-        force: measured force [N] and moment; empty without a sensor.
+        number: number of the message.
+        joints, further: positions of the robot's axes and of the external axes [degrees].
+        force: measured force (3) [N] and moment (3) [N m]; empty without a sensor.
         running: True if the controller follows commands.
     """
 
@@ -433,11 +463,12 @@ def read_robot(data: bytes) -> FromRobot:
 
 
 def to_robot(number: int, time: float, joints: Sequence[float], further: Sequence[float]) -> bytes:
-    """Encode a message that commands a controller's axes.
+    """Encode a message that commands the axes of a controller.
 
     Args:
-        time: of the message [s].
-        joints, further: axes of the robot, and external ones [degrees].
+        number: number of the message.
+        time: time of the message [s].
+        joints, further: positions of the robot's axes and of the external axes [degrees].
     """
     header = _number(1, number) + _number(2, round(1e3 * time) % 2**32) + _number(3, CORRECTION)
     planned = _bytes(1, _packed(joints))
@@ -460,8 +491,8 @@ def _doubles(data: bytes, numbers: tuple[int, ...]) -> tuple[float, ...]:
 
 
 def _fields(data: bytes) -> Iterator[tuple[int, int | bytes]]:
-    """Yield the fields of a message with their numbers: varints as integers, all others as
-    bytes."""
+    """Yield number and value of each field of a protobuf message: varints as integers, all others
+    as bytes."""
     place = 0
     while place < len(data):
         key, place = _varint(data, place)

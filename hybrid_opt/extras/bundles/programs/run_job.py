@@ -187,8 +187,8 @@ class Run:
         self.node.create_subscription(type_of(source["kind"]), source["topic"], heard, NEWEST)
 
     def _switch(self) -> None:
-        """Switch the hands where the job requires it. A refusal is reported as a fault when it
-        arrives."""
+        """Switch the hands as the job requires at its present place. A refusal is reported as a
+        fault when it arrives."""
         if self.machine.grip == self._switched:
             return
         self._switched = self.machine.grip
@@ -243,6 +243,9 @@ class Run:
 
     def wait(self, futures: Sequence[Any], what: str) -> list[Any]:
         """Wait for futures and return their results.
+
+        Args:
+            what: what is awaited, for the message.
 
         Raises:
             Refused: they take longer than `PATIENCE`.
@@ -318,8 +321,8 @@ class Run:
         """Send each controller its part of the path, and wait until it is accepted.
 
         Args:
-            moments: the path.
-            begin: time of the first point [s].
+            moments: future states of the job on its path.
+            begin: time at which the first state is to be reached [s].
 
         Raises:
             Refused: a controller rejects it.
@@ -358,8 +361,13 @@ class Run:
         return FollowJointTrajectory.Goal(trajectory=trajectory)
 
     def _joined(self, arms: Sequence[int], rows: Sequence[Sequence[Any]]) -> list[Any]:
-        """Return the values of several arms' joints in one list per row; a joint that moves both
-        arms is taken from the first."""
+        """Join the values of several arms' joints to one list per row. A joint that moves both arms
+        is taken from the first of them.
+
+        Args:
+            arms: indices of the arms.
+            rows: for each arm the values of its joints.
+        """
         found: dict[str, Any] = {}
         for arm, row in zip(arms, rows, strict=True):
             for name, value in zip(self.job.robots[arm]["ros_joints"], row, strict=True):
