@@ -37,7 +37,7 @@ tighter, but evaluated candidates have more digits than zeros."""
 
 @dataclass(frozen=True)
 class EvaluatedCandidates:
-    """The content of a file of evaluated candidates.
+    """Content of a file of evaluated candidates.
 
     Attributes:
         evaluations: every candidate in the order of evaluation.
@@ -53,8 +53,14 @@ class EvaluatedCandidates:
 def _groups(
     n_var: int, objective_names: tuple[str, ...], reasons: tuple[str, ...] = REASONS
 ) -> dict[str, list[str]]:
-    """Return the names of the columns of numbers, by the field of `Evaluations` that they
-    contain."""
+    """Return the names of the columns of numbers, by the field of `Evaluations` that the columns
+    hold.
+
+    Args:
+        n_var: length of the decision vector.
+        objective_names: names of the objectives.
+        reasons: names of the constraints.
+    """
     return {
         "x": [f"x_{k + 1}" for k in range(n_var)],
         "objectives": [f"objective_{name}" for name in objective_names],
@@ -67,12 +73,18 @@ def _groups(
 def columns(
     n_var: int, objective_names: tuple[str, ...], reasons: tuple[str, ...] = REASONS
 ) -> list[str]:
-    """Return the names of all columns."""
+    """Return the names of all columns of a file of candidates, in order.
+
+    Args:
+        n_var: length of the decision vector.
+        objective_names: names of the objectives.
+        reasons: names of the constraints.
+    """
     return [*_FIXED, *chain(*_groups(n_var, objective_names, reasons).values())]
 
 
 def encode(candidates: EvaluatedCandidates) -> bytes:
-    """Return the content of the file. Equal candidates always give equal bytes."""
+    """Return candidates as the content of a file. Equal candidates always give equal bytes."""
     found = candidates.evaluations
     words = {FEASIBLE: "", **dict(enumerate(REASONS))}
     width = found.x.shape[1]
@@ -140,10 +152,19 @@ def _text(line: bytes) -> str:
 
 
 def _rows(file: gzip.GzipFile, width: int, most: int) -> tuple[Array, NDArray[np.int8]]:
-    """Read the numbers (n, width - 1) and reasons (n,) of all rows.
+    """Read all rows of candidates.
 
-    Rows are read one by one, so memory holds only the result, and a small file cannot expand into a
-    huge one: each row has its number, and there are at most `most` numbers.
+    Rows are read one by one and at most `most` numbers in all, so a small file cannot expand to a
+    huge amount of memory.
+
+    Args:
+        file: the file, after its header.
+        width: number of columns.
+        most: largest number of numbers in the file.
+
+    Returns:
+        Numbers (n, width - 1) of the n candidates, and index (n,) of the constraint that each
+            violates first.
     """
     reasons = {"": FEASIBLE, **{reason: k for k, reason in enumerate(REASONS)}}
     numbers, found = array("d"), array("b")

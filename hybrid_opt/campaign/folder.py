@@ -68,7 +68,7 @@ class ExecutionSettings:
     overwrite: bool = False
 
     def __post_init__(self) -> None:
-        """Check every value.
+        """Check every setting.
 
         Raises:
             SettingsError: a value is not allowed; the message states the allowed values.
@@ -99,8 +99,9 @@ _PACKAGES = ("casadi", "moocore", "numpy", "pin", "pymoo", "python-fcl", "scipy"
 
 @cache
 def environment() -> Mapping[str, str]:
-    """Return the versions of software that affects a search, and a digest of the sources, by
-    name."""
+    """Return the versions of the software that affects a search, and a digest of this project's
+    sources, by name.
+    """
     versions = {name: version(name) for name in _PACKAGES}
     versions["dual-arm-carry"] = own_version()  # beside the digest of the sources
     versions["sources"] = source_digest("symbolic", "codegen", "hybrid_opt")
@@ -149,12 +150,12 @@ def differences(first: Any, second: Any, key: str = "") -> Iterator[tuple[str, A
     """Yield the differences of two trees of JSON values.
 
     Args:
-        first: JSON values.
-        second: JSON values to compare with `first`.
-        key: key path of both trees, put in front of the yielded keys.
+        first: tree of JSON values.
+        second: tree to compare with `first`.
+        key: key path of both trees, put in front of the yielded key paths.
 
     Yields:
-        Key path joined by points, value in `first`, value in `second`; None if missing.
+        Key path joined by points, value in `first`, and value in `second`; a missing value is None.
     """
     if isinstance(first, dict) and isinstance(second, dict):
         for name in dict.fromkeys((*first, *second)):
@@ -283,7 +284,12 @@ def _clear(root: Path) -> None:
 
 
 def _stored_cell(root: Path, files: CellFiles) -> Workcell:
-    """Return the workcell of the folder's copy. The copy is made if it is missing."""
+    """Return the workcell in the results folder, after copying the given files there if it is
+    missing.
+
+    Raises:
+        ResultsError: the workcell in the folder was changed after the campaign began.
+    """
     folder = root / WORKCELL
     if not folder.exists():
         draft = root / f".{WORKCELL}"

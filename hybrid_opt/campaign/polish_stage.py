@@ -27,16 +27,16 @@ from symbolic.read.cell_files import CellFiles
 
 @dataclass(frozen=True)
 class PolishRequest:
-    """Request to polish one front.
+    """Request to polish one front; it can be sent to another process.
 
     Attributes:
         files: files of the campaign's cell.
         settings: settings of the campaign.
         polish: settings of the polish.
-        algorithm, replica: name of the algorithm and number of the replica of the front
-            (`Front.key`).
-        x: (k, n_var) members of the front.
-        paths: (m, n_path) further known paths.
+        algorithm: name of the algorithm that found the front.
+        replica: number of the replica that found the front.
+        x: (k, n_var) decision vectors of the front.
+        paths: (m, n_path) further known paths from which the polish may start.
     """
 
     files: CellFiles
@@ -49,7 +49,7 @@ class PolishRequest:
 
 
 def polish_front(request: PolishRequest, progress: ShowProgress = False) -> bytes:
-    """Polish one front. Return the content of its file."""
+    """Polish one front and return the content of its file, a `PolishedFront` as JSON."""
     use_one_thread()
     settings = request.settings
     done = polish(
@@ -65,11 +65,12 @@ def polish_front(request: PolishRequest, progress: ShowProgress = False) -> byte
 def polish_stage(
     settings: PolishSettings, known: Callable[[CampaignFolder], Array] | None = None
 ) -> Stage:
-    """Return the stage that polishes the fronts of `CampaignResults.to_polish`.
+    """Return the stage of a study that polishes the fronts of `CampaignResults.to_polish`.
 
     Args:
         settings: settings of the polish.
-        known: function of the folder that returns further known paths (m, n_path); None for none.
+        known: function that returns further known paths (m, n_path) for an open results folder;
+            None for no further paths.
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
@@ -93,7 +94,8 @@ def polish_stage(
 
 
 def _is_polished(folder: CampaignFolder, front: Front) -> bool:
-    """Return True if the file of a front's polish exists and is undamaged. A damaged one is
-    computed again."""
+    """Return True if the polished front is stored and undamaged; a damaged file is to be computed
+    again.
+    """
     exists = polished_file(folder.root, *front.key).exists()
     return is_whole(exists, lambda: read_polished(folder.root, front))

@@ -60,7 +60,7 @@ _record_of = lru_cache(maxsize=CACHED_TABLES)(record_of)
 
 @dataclass(frozen=True)
 class Replica:
-    """A replica with a finished search; arrays are read-only.
+    """Finished search of one replica; arrays are read-only.
 
     Attributes:
         algorithm: name of the search algorithm.
@@ -79,7 +79,9 @@ class Replica:
 
     @cached_property
     def front_rows(self) -> NDArray[np.intp]:
-        """(k,) rows of the non-dominated feasible candidates, by increasing objectives."""
+        """(k,) indices into `evaluations` of the non-dominated feasible candidates, by increasing
+        first objective.
+        """
         return metrics.front_rows(self.evaluations.objectives, self.evaluations.feasible)
 
     @property
@@ -126,7 +128,9 @@ class CampaignResults:
 
     @property
     def _figures(self) -> dict[str, str]:
-        """The fronts of each kind, and the file of the recommended carry."""
+        """Number and sizes of the fronts by title, and the file of the recommended carry if there
+        is one.
+        """
         sizes: dict[str, list[int]] = {}
         for front in self.fronts:
             sizes.setdefault(front.title, []).append(len(front))
@@ -171,10 +175,10 @@ class CampaignResults:
 
     @cached_property
     def to_polish(self) -> tuple[Front, ...]:
-        """Fronts that the polish starts from.
+        """Fronts from which the polish starts.
 
-        These are the fronts of all replicas; in a drivable experiment, one front of the
-        non-dominated candidates of all replicas (`UNION`).
+        These are the fronts of all replicas. In a drivable experiment it is a single front,
+        `UNION`, of the non-dominated candidates of all replicas.
         """
         if not self.workcell.task.law.is_drivable:
             return self.searched
@@ -183,9 +187,9 @@ class CampaignResults:
 
     @property
     def fronts(self) -> tuple[Front, ...]:
-        """Fronts of all replicas, each followed by the polished front if there is one.
+        """Fronts of all replicas, each followed by its polished front if there is one.
 
-        The polished union comes last, if there is one.
+        The polished front of the union of all replicas comes last, if there is one.
 
         Raises:
             ResultsError: the file of a polished front is damaged.
@@ -213,13 +217,13 @@ class CampaignResults:
 
 
 def union(fronts: Sequence[Front]) -> list[tuple[Front, int]]:
-    """Return the non-dominated carries of several fronts together.
+    """Find the carries that no carry of several fronts dominates.
 
     Args:
         fronts: fronts with the same objectives.
 
     Returns:
-        For each carry, its front and its index in that front; by increasing objectives.
+        For each such carry its front and its index in that front, by increasing first objective.
     """
     members = [(front, row) for front in fronts for row in range(len(front))]
     objectives = np.concatenate([front.objectives for front in fronts])
@@ -302,8 +306,7 @@ def read_replica(root: Path, algorithm: str, number: int, objectives: tuple[str,
 
 
 def is_whole(exists: bool, read: Callable[[], object]) -> bool:
-    """Return True if the result of a stage exists and can be read. A damaged result is reported as
-    a warning.
+    """Return True if a stored result exists and can be read. Warn of a damaged one.
 
     Args:
         exists: True if the result exists.
@@ -320,7 +323,7 @@ def is_whole(exists: bool, read: Callable[[], object]) -> bool:
 
 
 def read_polished(root: Path, front: Front) -> PolishedFront | None:
-    """Read the polished front that belongs to a front; None if it was not polished.
+    """Read the polished front that was made from a front; None if the front was not polished.
 
     Args:
         root: the results folder.

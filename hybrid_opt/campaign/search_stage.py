@@ -22,12 +22,13 @@ from symbolic.read.cell_files import CellFiles
 
 @dataclass(frozen=True)
 class SearchRequest:
-    """Request to search one replica.
+    """Request to run the search of one replica; it can be sent to another process.
 
     Attributes:
         files: files of the campaign's cell.
         settings: settings of the campaign.
-        algorithm, replica: name of the algorithm and number of the replica.
+        algorithm: name of the search algorithm.
+        replica: number of the replica, from 0.
     """
 
     files: CellFiles
@@ -37,7 +38,11 @@ class SearchRequest:
 
 
 def search_replica(request: SearchRequest, progress: ShowProgress = False) -> bytes:
-    """Search one replica from its seed. Return the content of its file."""
+    """Run the search of one replica and return the content of its file.
+
+    The random numbers depend only on the campaign's seed, the algorithm's name and the replica's
+    number.
+    """
     settings, algorithm = request.settings, request.algorithm
     cell = loaded_cell(request.files, settings.objectives)
     # None: the hand-made trajectory.
@@ -58,10 +63,10 @@ def search_replica(request: SearchRequest, progress: ShowProgress = False) -> by
 
 
 def search_stage(function: ReplicaFunction[SearchRequest] = search_replica) -> Stage:
-    """Return the stage that searches all replicas.
+    """Return the stage of a study that runs the searches of all replicas.
 
     Args:
-        function: function that searches one replica.
+        function: function that runs one search and returns the content of its file.
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
@@ -81,15 +86,23 @@ def search_stage(function: ReplicaFunction[SearchRequest] = search_replica) -> S
 
 
 def _is_done(folder: CampaignFolder, key: tuple[str, int]) -> bool:
-    """Return True if the file of a replica exists and is undamaged. A damaged replica is searched
-    again, with the same bits as result."""
+    """Return True if the file of a replica exists and is undamaged; a damaged replica is to be
+    searched again, which gives the same bits.
+
+    Args:
+        folder: the results folder.
+        key: name of the algorithm and number of the replica.
+    """
     exists = replica_file(folder.root, *key).exists()
     objectives = folder.settings.objectives
     return is_whole(exists, lambda: read_replica(folder.root, *key, objectives))
 
 
 def _replicas(folder: CampaignFolder) -> dict[tuple[str, int], Path]:
-    """Return the file of every replica, ordered by number. So every algorithm has results early."""
+    """Return the file of every replica by algorithm name and replica number.
+
+    They are ordered by replica number, so that every algorithm has results early.
+    """
     settings = folder.settings
     return {
         (algorithm, replica): replica_file(folder.root, algorithm, replica)

@@ -33,7 +33,7 @@ SIZE_KEYS = ("population", "swarm", "batch")
 
 
 def sized(algorithm: str, size: int) -> dict[str, Any]:
-    """Return the settings of an algorithm that evaluates `size` candidates per generation."""
+    """Return the settings with which an algorithm evaluates `size` candidates per generation."""
     known = asdict(metaheuristics.settings_of(algorithm))
     return {key: size for key in SIZE_KEYS if key in known}
 
@@ -41,7 +41,8 @@ def sized(algorithm: str, size: int) -> dict[str, Any]:
 def chosen(
     names: Sequence[str], populations: Sequence[tuple[str, int]] = ()
 ) -> dict[str, dict[str, Any]]:
-    """Return the algorithms of a campaign with the settings that differ from the defaults.
+    """Return the algorithms of a campaign by name, each with its settings that are not the
+    defaults.
 
     Args:
         names: names of search algorithms in `hybrid_opt.metaheuristics`, each once.
@@ -125,12 +126,12 @@ StageStatus = Literal["running", "done", "outdated"]
 
 @dataclass(frozen=True)
 class StoredCell:
-    """The workcell of a campaign.
+    """Identity of the workcell of a campaign.
 
     Attributes:
-        name: title of the workcell, for people.
-        file: path of the workcell copy, relative to the results folder.
-        digest: digest of the workcell and its files.
+        name: title of the workcell.
+        file: path of the workcell's copy, relative to the results folder.
+        digest: digest of the workcell file and of the files that it names.
     """
 
     name: str

@@ -75,7 +75,13 @@ class Stage:
 
 
 def run_stages(folder: CampaignFolder, stages: Sequence[Stage], progress: Progress) -> None:
-    """Run the stages, in order, that are not done yet or whose files were damaged since.
+    """Run those stages, in order, that are not done or whose files are damaged. Once a stage has
+    run, all later stages run as well.
+
+    Args:
+        folder: the open results folder.
+        stages: all stages of the study, in order.
+        progress: display of progress.
 
     Raises:
         ResultsError: a stage began with other settings.
@@ -144,14 +150,16 @@ one question, which carry to run, and the fronts of its replicas differ by about
 
 
 def drivable_settings(settings: CampaignSettings, replicas: int | None = None) -> CampaignSettings:
-    """Return the settings of the drivable experiment beside another experiment.
+    """Return the settings of the drivable experiment that accompanies another experiment of a
+    study.
 
-    They differ only in the objectives, which are durations and forces of the kind that the other
-    experiment minimises, and in the replicas.
+    They differ from the other experiment's in the number of replicas and in the objectives:
+    durations, and forces of the kind, planned or robust, that the other experiment minimises.
 
     Args:
         settings: settings of the other experiment.
-        replicas: number of replicas per algorithm; None for as many, at most `DRIVABLE_REPLICAS`.
+        replicas: number of replicas per algorithm; None for the number of the other experiment, but
+            at most `DRIVABLE_REPLICAS`.
 
     Raises:
         SettingsError: the number of replicas is not allowed.
@@ -163,13 +171,13 @@ def drivable_settings(settings: CampaignSettings, replicas: int | None = None) -
 
 
 def drivable_stage(stages: Sequence[Stage], replicas: int | None = None) -> Stage:
-    """Return the stage that searches for drivable carries, in the folder `drivable/`.
+    """Return the stage of a study that runs the drivable experiment, in the subfolder `drivable/`.
 
-    The folder contains a complete campaign of the drivable variant of the study's cell.
+    The subfolder contains a complete campaign of the drivable variant of the study's cell.
 
     Args:
-        stages: stages of that campaign.
-        replicas: number of replicas per algorithm; None for as many as the study, at most
+        stages: stages of this campaign.
+        replicas: number of replicas per algorithm; None for the number of the study, but at most
             `DRIVABLE_REPLICAS`.
     """
 
@@ -196,14 +204,22 @@ COMPETITION_REPLICAS = 2
 def decided_cell(
     workcell: Workcell, settings: CampaignSettings, execution: ExecutionSettings
 ) -> tuple[Workcell, BranchCompetition | None]:
-    """Return the workcell with decided start branches, and the competition that decided them; None
-    if the workcell's file states them.
+    """Choose the start branches of a workcell whose file leaves them to a search.
 
-    A campaign that is continued keeps its first decision.
+    A campaign that is continued keeps its first choice.
+
+    Args:
+        workcell: the workcell.
+        settings: settings of the campaign.
+        execution: settings of the execution, with the results folder.
+
+    Returns:
+        Workcell with fixed start branches, and the competition that chose them; None for the latter
+            if the workcell file states the branches.
 
     Raises:
-        DualArmError: no pair of branches can carry the box on any trajectory, or the stored
-            decision is damaged.
+        DualArmError: no pair of branches can carry the box on any trajectory, or the stored choice
+            is damaged.
     """
     if SEARCHED_BRANCH not in workcell.start_branch:
         return workcell, None
@@ -219,19 +235,26 @@ def decided_cell(
 
 
 def read_branches(root: Path) -> BranchCompetition | None:
-    """Read the decision on a study's start branches from a results folder; None if the workcell's
-    file states them.
+    """Read from a results folder the competition that chose a study's start branches; None if the
+    workcell file states them.
 
     Raises:
-        ResultsError: the stored decision is damaged.
+        ResultsError: the stored competition is damaged.
     """
     stored = root / BRANCHES
     return read_record(BranchCompetition, stored, _ANEW) if stored.exists() else None
 
 
 def store_branches(root: Path, competition: BranchCompetition | None) -> str:
-    """Store a decision on start branches in a results folder. Return its text for the terminal; ''
-    for None."""
+    """Store the competition that chose the start branches in a results folder.
+
+    Args:
+        root: the results folder.
+        competition: the competition; None if there was none.
+
+    Returns:
+        Text of the competition for a terminal; '' for None.
+    """
     if competition is None:
         return ""
     write_json(root / BRANCHES, to_json(competition))
@@ -263,7 +286,7 @@ def store_results(
     left: Mapping[Path, Argument],
     done: int,
 ) -> None:
-    """Compute missing files by the workers, and store each when it is finished.
+    """Compute missing files of a stage by the workers, and store each as soon as it is computed.
 
     If a stage has only one file, this process computes it and shows its progress.
 
@@ -271,8 +294,8 @@ def store_results(
         folder: the results folder.
         progress: display of progress.
         stage: title of the work, unit of its progress, and number of units per file.
-        function: function that returns the content of a file.
-        left: argument of the function for each missing file.
+        function: function that computes the content of a file from an argument.
+        left: argument of `function` for each missing file.
         done: number of files that already exist.
     """
     title, unit, each = stage
@@ -294,9 +317,9 @@ def store_results(
 
 @lru_cache(maxsize=2)
 def loaded_cell(files: CellFiles, objectives: tuple[str, ...]) -> Cell:
-    """Return the cell with these files. Each process caches the last cells.
+    """Return the cell of stored workcell files. Each process caches the last cells.
 
-    One thread evaluates its candidates, since workers share the cores.
+    Candidates are evaluated by a single thread, because several workers share the cores.
     """
     return Cell.from_files(files, objectives, threads=1)
 
@@ -305,19 +328,24 @@ Made = TypeVar("Made")
 
 
 def with_cell(of_workcell: Callable[[Workcell], Made], files: CellFiles) -> Made:
-    """Return the result of a function of a stored workcell. The files of the workcell exist only
-    during the call."""
+    """Unpack workcell files to a temporary folder and return the result of a function of the
+    workcell. The folder exists only during the call.
+
+    Args:
+        of_workcell: function of the workcell.
+        files: files of the workcell.
+    """
     with TemporaryDirectory() as folder:
         return of_workcell(unpack_cell(files, Path(folder)))
 
 
 @dataclass(frozen=True)
 class ReadyCell:
-    """A cell with everything loaded that its carries need: evaluation, timing and jobs.
+    """A cell with its compiled functions for evaluation, timing and jobs loaded.
 
     Attributes:
         cell: the cell.
-        jobs: planner of its jobs; `jobs.timing` times its paths.
+        jobs: planner of the cell's jobs; `jobs.timing` times its paths.
     """
 
     cell: Cell
@@ -325,8 +353,9 @@ class ReadyCell:
 
     @classmethod
     def of(cls, objectives: tuple[str, ...], workcell: Workcell) -> ReadyCell:
-        """Load a cell with everything that is otherwise loaded on first use, since the cell's files
-        exist only now."""
+        """Load everything that a cell otherwise loads on first use, when its temporary files may be
+        gone.
+        """
         # Not imported at the top: other stages time nothing.
         from hybrid_opt.timing.path_timer import search_carry, search_timing
 
@@ -343,12 +372,14 @@ Cells = tuple[tuple[CellFiles, tuple[str, ...]], ...]
 
 
 def cells_of(files: CellFiles, objectives: tuple[str, ...], driven: bool) -> Cells:
-    """Return an experiment's cell and its drivable variant, whose contact model may differ.
+    """Return the files and objectives of an experiment's cell and of its drivable variant.
+
+    The contact models of the two may differ.
 
     Args:
         files: files of the experiment's cell.
-        objectives: objectives of the experiment.
-        driven: True if the experiment's cell is already drivable.
+        objectives: names of the experiment's objectives.
+        driven: True if the experiment's cell is already drivable; it is then the only entry.
     """
     own = (files, objectives)
     if driven:
@@ -358,8 +389,9 @@ def cells_of(files: CellFiles, objectives: tuple[str, ...], driven: bool) -> Cel
 
 @lru_cache(maxsize=1)
 def ready_cells(cells: Cells) -> tuple[ReadyCell, ...]:
-    """Load the compiled functions of cells, or build missing ones. Each process caches the last
-    cells."""
+    """Load the compiled functions of cells, after building those that are missing. Each process
+    caches the latest result.
+    """
     return tuple(with_cell(partial(ReadyCell.of, names), files) for files, names in cells)
 
 
@@ -373,16 +405,17 @@ _ELAPSED_INTERVAL = 1.0
 
 
 def build_study(cell: Cell, progress: Progress, polish: bool = True, drivable: bool = True) -> None:
-    """Load or build the compiled functions of a study, with compilers in parallel.
+    """Load the compiled functions of a study, after building those that are missing with several
+    compilers in parallel.
 
-    Rows of arms' clearances are compiled later, during a polish. The first caller of functions that
-    could not be built reports the failure.
+    Functions of clearances between the arms are compiled later, during a polish. A function that
+    cannot be built raises its error where it is used first.
 
     Args:
         cell: a cell that was read from a file.
         progress: display of progress.
-        polish: whether fronts are polished.
-        drivable: whether drivable carries are searched too.
+        polish: True if fronts are polished.
+        drivable: True if drivable carries are searched as well.
     """
     cache = cell.compiled.cache or Cache()
     what = (str(cell.force_kind), str(polish), str(drivable), compiler_of(cache).identity)
@@ -400,7 +433,7 @@ def build_study(cell: Cell, progress: Progress, polish: bool = True, drivable: b
 
 
 def build_all(makers: Sequence[Maker], progress: Progress) -> list[DualArmError]:
-    """Load or build functions in parallel.
+    """Load or build compiled functions in parallel.
 
     A function that cannot be built raises no error here, but where it is called first. Ctrl-C ends
     all compilers. Finished libraries are kept; threads that build expressions are not waited for.

@@ -1,9 +1,9 @@
-"""Effects of the arms' stiffness on forces: position-controlled arms, and arms that start at
-different times.
+"""Effects of the arms' stiffness on the contact forces, if the arms are position controlled or if
+one arm starts later than the other.
 
-A position-controlled arm presses by aiming at a point inside the box; its stiffness k at the pad
-turns the penetration into force. Both arms hold the box like springs in series, so a relative
-displacement d of the pads changes the squeeze by k d / 2.
+A position-controlled arm presses by aiming at a point inside the box; its stiffness k [N/m] at the
+pad turns the depth of that point into force. Both arms hold the box like springs in series, so a
+relative displacement d of the pads changes the squeeze by k d / 2.
 """
 
 from __future__ import annotations
@@ -43,14 +43,16 @@ _BISECTIONS = 16
 
 @dataclass(frozen=True)
 class PositionControl:
-    """Forces under position control at one stiffness.
+    """Contact forces of a job if both arms are position controlled with a given stiffness.
 
     Attributes:
         stiffness: stiffness of each arm at its pad [N/m].
-        penetration: (2,) largest depth inside the box at which each arm has to aim [m].
-        force_error: change of the normal force if both arms err by `POSITION_ERROR` [N].
-        share: `force_error` over the least commanded force while the box is held.
-        margin: least excess of the commanded force over the force that holds the box [N].
+        penetration: (2,) depth inside the box at which each arm has to aim, the largest of the job
+            [m].
+        force_error: change of the normal force if each arm's position is wrong by `POSITION_ERROR`
+            [N].
+        share: ratio of `force_error` to the least commanded force while the box is held.
+        margin: least excess of the commanded normal force over the force that holds the box [N].
     """
 
     stiffness: float
@@ -61,7 +63,7 @@ class PositionControl:
 
     @property
     def verdict(self) -> str:
-        """Feasibility of position control, in words."""
+        """Text that states whether position control is feasible."""
         if self.share <= TRACKED:
             return "yes"
         if self.force_error <= self.margin:
@@ -71,16 +73,20 @@ class PositionControl:
 
 @dataclass(frozen=True)
 class Skew:
-    """Effect of a delay of one arm while the box is held, at one stiffness.
+    """Effect on the contact forces if one arm is late while the box is held, for arms of a given
+    stiffness.
+
+    The values are the worst of two cases: either arm may be the late one.
 
     Attributes:
-        delay: delay of one arm behind the other [s].
+        delay: time by which one arm is behind the other [s].
         stiffness: stiffness of each arm at its pad, the same in all directions [N/m].
         displacement: largest relative displacement of the pads [m].
-        force_change: largest change of the normal forces [N].
-        share: `force_change` over the normal force commanded at the same moment.
+        force_change: largest change of a normal force [N].
+        share: largest ratio of the change of a normal force to the force commanded at the same
+            time.
         margin: least excess of the changed normal force over the force that holds the box [N].
-        late: index of the delayed arm in the worse of both cases.
+        late: index of the delayed arm in the case with the least margin.
     """
 
     delay: float
@@ -93,12 +99,17 @@ class Skew:
 
     @property
     def is_held(self) -> bool:
-        """True if friction still holds the box everywhere."""
+        """True if friction still holds the box in every phase."""
         return self.margin >= 0.0
 
 
 def position_control(job: Job, stiffness: float) -> PositionControl:
-    """Compute the forces of a job if arms of a stiffness [N/m] track positions.
+    """Compute the contact forces of a job if both arms are position controlled instead of one being
+    force controlled.
+
+    Args:
+        job: the whole job.
+        stiffness: stiffness of each arm at its pad [N/m].
 
     Raises:
         SettingsError: the stiffness is not positive.
@@ -112,22 +123,23 @@ def position_control(job: Job, stiffness: float) -> PositionControl:
 
 
 def force_margin(job: Job) -> float:
-    """Compute the least excess of the commanded normal force over the force that holds the box [N],
-    over the phases in which the box is held."""
+    """Compute by how much the commanded normal force exceeds the planned force that holds the box
+    [N]: the least value of both robots over all phases in which the box is held.
+    """
     return min(float((p.force.normal - p.force.least).min()) for p in job.held)
 
 
 def skewed(job: Job, delay: float, stiffness: float) -> Skew:
-    """Compute the effect on the forces if one arm is late while the box is held, for the arm with
-    the worse effect.
+    """Compute the effect on the contact forces if one arm is late while the box is held; the worst
+    of either arm being late.
 
-    The arms act as quasi-static springs. A relative displacement of the pads along the normal
-    changes the squeeze. A displacement across the normal adds a tangential force that friction has
-    to bear.
+    The arms act as quasi-static springs. A relative displacement of the pads along the contact
+    normal changes the squeeze. A displacement across the normal adds a tangential force that
+    friction has to bear.
 
     Args:
         job: the whole job.
-        delay: delay of one arm behind the other [s].
+        delay: time by which one arm is behind the other [s].
         stiffness: stiffness of each arm at its pad [N/m].
 
     Raises:
@@ -150,10 +162,11 @@ def _worst(job: Job, delay: float, stiffness: float) -> Skew:
 
 
 def separation(job: Job, delay: float) -> float:
-    """Compute the largest relative displacement of the pads [m] by a delay [s] of either arm.
+    """Compute the largest relative displacement of the pads [m] if either arm is late by a delay
+    [s] while the box is held.
 
-    Only the phases in which the box is held count. The result also applies to an arm that stops
-    alone: the delay is then the time for which the other arm continues at the planned speed.
+    The result also applies to an arm that stops alone: the delay is then the time for which the
+    other arm continues at the planned speed.
     """
     return max(
         float(np.linalg.norm(_displacement(job, phase, late, delay)[1], axis=1).max())
@@ -214,9 +227,15 @@ def require_skew(job: Job, delay: float, stiffness: float) -> None:
 def _displacement(job: Job, phase: Phase, late: int, delay: float) -> tuple[Array, Array, Array]:
     """Compute how a delay displaces the pad of the late arm in a phase.
 
+    Args:
+        job: the whole job.
+        phase: phase of the job in which the box is held.
+        late: index of the late arm.
+        delay: time by which the arm is late [s].
+
     Returns:
-        Mask of the samples with distinct times (n of them), displacement (n, 3) [m] and contact
-        normal (n, 3), both in the world frame.
+        Mask of the samples of the phase without repeated times; displacement (n, 3) [m] and contact
+            normal (n, 3) at these n samples, both in the world frame.
     """
     motion, contact = phase.motion, job.workcell.contacts[late]
     keep = np.concatenate([[True], np.diff(motion.time) > 0.0])
@@ -271,7 +290,7 @@ def require_delay(delay: float) -> None:
 
 
 def position_text(found: Sequence[PositionControl]) -> str:
-    """Format a table of the forces under position control, one row per stiffness."""
+    """Format a table of contact forces under position control, one row per stiffness."""
     rows = [
         [
             f"{each.stiffness:g}",

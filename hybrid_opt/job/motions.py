@@ -57,11 +57,12 @@ _MOVING = ("rate", "second_rate", "q_rate", "q_second")
 
 @dataclass(frozen=True)
 class RestToRestProfile:
-    """Rest-to-rest profile h and its time derivatives at n evenly spaced samples.
+    """Rest-to-rest profile h(t) from 0 to 1, at n evenly spaced times.
 
     Attributes:
-        time: (n,) from 0 to the duration [s].
-        value, rate, second, third: (n,) h and its first three time derivatives.
+        time: (n,) times from 0 to the duration [s].
+        value: (n,) profile h.
+        rate, second, third: (n,) first, second and third time derivative of h.
     """
 
     time: Array
@@ -72,7 +73,12 @@ class RestToRestProfile:
 
 
 def rest_to_rest_profile(duration: float, samples: int) -> RestToRestProfile:
-    """Compute the profile from 0 to 1 within a duration [s] at so many samples."""
+    """Compute the rest-to-rest profile from 0 to 1.
+
+    Args:
+        duration: time from 0 to 1 [s].
+        samples: number of evenly spaced samples.
+    """
     share = np.linspace(0.0, 1.0, samples)
     # Rounding must not leave [0, 1]; the last values of a polynomial of degree 7 would.
     value = np.clip(_H(share), 0.0, 1.0)
@@ -83,19 +89,22 @@ def rest_to_rest_profile(duration: float, samples: int) -> RestToRestProfile:
 
 
 def at_even_steps(duration: float, step: float) -> float:
-    """Round a duration up to a whole number of steps [s]."""
+    """Round a duration [s] up to a whole multiple of a time step [s]."""
     return float(np.ceil(duration / step - 1e-9) * step)
 
 
 @dataclass(frozen=True)
 class Straight:
-    """A straight translation of the box, of both pads, or of both together.
+    """Straight translation of the box, of both pads, or of the box and the pads together.
+
+    The place of a pad is given by the pose that the box would have if the pad touched it at the
+    contact point.
 
     Attributes:
         name: name of the phase.
-        box: (2, 6) box poses at beginning and end [m, rad].
-        held: (2, 2, 6) for each arm, box poses at beginning and end that place the pad as desired
-            [m, rad]; they differ from `box` while the pad is away from the box.
+        box: (2, 6) box poses at beginning and end, world frame [m, rad].
+        held: (2, 2, 6) places of the pads as box poses [m, rad], by arm, then beginning and end;
+            they differ from `box` while the pad is away from the box.
         speed: largest speed [m/s].
     """
 
@@ -106,13 +115,20 @@ class Straight:
 
     @property
     def length(self) -> float:
-        """Length of the longest translation of box and pads [m]."""
+        """Largest distance that the box or a pad travels [m]."""
         ways = np.concatenate([self.box[None], self.held])
         return float(np.linalg.norm((ways[:, 1] - ways[:, 0])[:, :3], axis=1).max())
 
     def at(self, share: Array) -> tuple[Array, Array, Array]:
-        """Compute poses (n, 6) at shares (n,) of the line: of the box, then the two box poses that
-        place the pads."""
+        """Compute the poses of box and pads at points of the line.
+
+        Args:
+            share: (n,) points, from 0 at the beginning to 1 at the end of the line.
+
+        Returns:
+            Poses (n, 6) of the box, then places (n, 6) of the pad of each arm as box poses [m,
+                rad].
+        """
         ways = np.concatenate([self.box[None], self.held])
         poses = ways[:, None, 0] + share[:, None] * (ways[:, 1] - ways[:, 0])[:, None]
         return poses[0], poses[1], poses[2]
@@ -121,14 +137,14 @@ class Straight:
 def straight(
     workcell: Workcell, name: str, box: Array, away: tuple[float, float], speed: float
 ) -> Straight:
-    """Build a straight motion of the box and of both pads between two box poses of the same
-    orientation. Pads move along their directions of approach.
+    """Build a straight motion of box and pads between two box poses of the same orientation. Pads
+    approach or leave the box along their directions of approach.
 
     Args:
         workcell: the workcell.
         name: name of the phase.
         box: (2, 6) box poses at beginning and end [m, rad].
-        away: distance of the pads from the box at beginning and end [m].
+        away: distance of the pads from the box at beginning and at end [m].
         speed: largest speed [m/s].
     """
     held, contact = np.array([box, box]), contact_model(workcell)
@@ -142,13 +158,17 @@ def straight(
 def lines_around(
     workcell: Workcell, handling: Handling, stands: tuple[Array, Array], pose: Array
 ) -> tuple[list[Straight], list[Straight]]:
-    """Build the straight motions before and after a carry, each list ordered from the carry
-    outwards.
+    """Build the straight motions before and after a carry: approach and lift, set down and retreat.
 
     Args:
+        workcell: the workcell.
         handling: heights, speeds and stand-off of the job.
-        stands: two poses (6,) of the box on its supports before and after the carry [m, rad].
+        stands: poses (6,) of the box on its supports before the carry and after it [m, rad].
         pose: (2, 6) box poses at the beginning and end of the carry [m, rad].
+
+    Returns:
+        Motions before the carry and motions after it; in each list the one next to the carry is
+            first.
     """
     away, speed = handling.stand_off, handling.pressing_speed
     stand, down = (np.tile(box, (2, 1)) for box in stands)
@@ -167,27 +187,28 @@ def lines_around(
 def follow_line(
     workcell: Workcell, posture: NumericFunction, line: Straight, known: Array, at_end: bool
 ) -> Array:
-    """Compute the joints of both arms (PHASE_SAMPLES, joints) along a line, by Newton's method from
-    a known end.
+    """Compute the joint positions (PHASE_SAMPLES, joints) of both arms along a line [rad], by
+    Newton's method from known positions at one end.
 
     The samples are evenly spaced in the time of the rest-to-rest profile. Newton's method first
-    solves places every `LINE_STEP`, one after the other, then starts from these at all samples
-    together. Redundant joints keep their positions of the known end.
+    solves points every `LINE_STEP`, one after the other. Interpolated, these solutions are the
+    initial guesses of all samples. Redundant joints keep their known positions.
 
     Args:
         workcell: the workcell.
         posture: compiled `symbolic.robot.arm.posture_function`.
         line: the line.
         known: (joints,) joint positions at one end of the line [rad].
-        at_end: True if these are the positions at the end of the line, False for its beginning.
+        at_end: True if `known` belongs to the end of the line, False for its beginning.
 
     Raises:
-        JobError: an arm does not reach a place within its joint range.
+        JobError: an arm does not reach a point of the line within its joint range.
     """
 
     def share(way: Array) -> Array:
-        """Convert shares of the line counted from the known end to shares counted from its
-        beginning."""
+        """Convert points in [0, 1] counted from the known end of the line to points counted from
+        its beginning.
+        """
         return 1.0 - way if at_end else way
 
     ways, passed = np.linspace(0.0, 1.0, int(np.ceil(line.length / LINE_STEP)) + 1), [known]
@@ -217,8 +238,16 @@ def follow_line(
 def solve_joints_at(
     workcell: Workcell, posture: NumericFunction, line: Straight, share: Array, guess: Array
 ) -> Array:
-    """Compute the joints of both arms (n, joints) at shares (n,) of a line, from initial guesses
-    (n, joints) [rad]. Joints are NaN where an arm does not reach the place."""
+    """Compute the joint positions (n, joints) of both arms [rad] at points of a line; NaN where an
+    arm does not reach its place.
+
+    Args:
+        workcell: the workcell.
+        posture: compiled `symbolic.robot.arm.posture_function`.
+        line: the line.
+        share: (n,) points, from 0 at the beginning to 1 at the end of the line.
+        guess: (n, joints) initial guesses of the joint positions [rad].
+    """
     guesses = [np.ascontiguousarray(own) for own in joints_of(workcell, guess)]
     found = []
     for arm, poses in enumerate(line.at(share)[1:], start=1):
@@ -230,7 +259,7 @@ def solve_joints_at(
 
 def time_line(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
     """Compute the motion along a line from rest to rest, as fast as the line's speed and the limits
-    allow.
+    of payload and joints allow.
 
     Args:
         model: timing model of the workcell.
@@ -287,7 +316,14 @@ def time_line(model: TimingModel, line: Straight, q: Array) -> PhaseMotion:
 
 
 def standing_still(motion: PhaseMotion, sample: int, time: Array) -> PhaseMotion:
-    """Return a motion that stays in the state of one sample of `motion`, at times (n,) [s]."""
+    """Return a motion that rests in the box pose and joint positions of one sample of another
+    motion.
+
+    Args:
+        motion: motion with the sample.
+        sample: index of the sample.
+        time: (n,) times of the result, from the beginning of the phase [s].
+    """
     arrays = {
         name: np.repeat(values[sample][None], len(time), axis=0)
         for name, values in vars(motion).items()
@@ -339,13 +375,18 @@ _NO_JUMP = 1e-6
 def holding(
     model: TimingModel, settings: SqueezeSettings, motions: Sequence[PhaseMotion]
 ) -> tuple[list[Force], Squeeze]:
-    """Compute the forces of consecutive phases in which the box is held.
+    """Compute the forces in consecutive phases in which the box is held.
+
+    Args:
+        model: timing model of the workcell.
+        settings: settings of the commanded forces.
+        motions: motion of each phase, in order of time.
 
     Returns:
-        Forces of each phase, and how the commanded forces came about.
+        Forces of each phase, and a record of how the commanded forces were computed.
 
     Raises:
-        SettingsError: the uncertainty leaves no friction or patch.
+        SettingsError: the uncertainty leaves no friction or contact patch.
     """
     ends = np.cumsum([0.0, *(motion.duration for motion in motions)])
     time = np.concatenate([m.time + at for m, at in zip(motions, ends[:-1], strict=True)])
@@ -368,16 +409,16 @@ def holding(
 def pressing(
     motion: PhaseMotion, hold: Force, sample: int, rate: float
 ) -> tuple[PhaseMotion, Force]:
-    """Compute a phase in which forces rise from zero, or fall to zero, while box and arms stand
-    still.
+    """Compute a phase in which the contact forces rise from zero, or fall to zero, while box and
+    arms stand still.
 
-    The weight of the box passes between its support and the arms with the same profile, so friction
-    is never used more than while the box is held.
+    The load on the support of the box falls by the same profile with which the load on the arms
+    rises, so friction is never used more than while the box is held.
 
     Args:
-        motion, hold: motion and forces of the phase that follows (rise) or precedes (fall).
+        motion, hold: motion and forces of the phase that follows a rise, or precedes a fall.
         sample: 0 for a rise to the first sample of that phase, -1 for a fall from its last sample.
-        rate: largest rate of a normal force [N/s].
+        rate: largest rate of change of a normal force [N/s].
     """
     peak = float(hold.normal[sample].max())
     duration = at_even_steps(PEAK_RATE * peak / rate, TICK)
@@ -394,9 +435,9 @@ def waiting(motion: PhaseMotion, sample: int, duration: float) -> tuple[PhaseMot
     """Compute a phase without forces in which the arms stand still while hands take hold or let go.
 
     Args:
-        motion: motion of the neighbouring phase.
-        sample: 0 to stand at the first sample of this motion, -1 at the last.
-        duration: least duration of the phase [s].
+        motion: motion of the phase before or after.
+        sample: 0 to stand where this motion begins, -1 to stand where it ends.
+        duration: least duration of the phase [s]; it is rounded up to whole ticks.
     """
     time = np.linspace(0.0, at_even_steps(duration, TICK), PHASE_SAMPLES)
     still = standing_still(motion, sample, time)
@@ -410,17 +451,21 @@ def zero_forces(motion: PhaseMotion) -> Force:
 
 
 def unit_squeeze(workcell: Workcell, pose: Array, leader: int = 0) -> Array:
-    """Compute the change (n, 2, 6) of both robots' wrenches on the box per newton of additional
-    commanded force, about the nominal contact points [N, N m].
+    """Compute by how much the wrenches of both robots on the box change per newton of additional
+    commanded force.
 
-    For pads with opposite normals both forces act on one line, midway between the nominal points,
-    and cancel. For other pads the change is an internal squeeze within all friction cones. For
-    hands that grip the box without a squeeze it is zero.
+    For pads with opposite normals both forces act on one line, midway between the nominal contact
+    points, and cancel. For other pads the change is an internal squeeze within all friction cones.
+    For hands that grip the box without a squeeze it is zero.
 
     Args:
         workcell: the workcell.
         pose: (n, 6) box poses [m, rad].
         leader: index of the position-controlled arm.
+
+    Returns:
+        Change (n, 2, 6) of force [N/N] and moment about the robot's nominal contact point [N m/N],
+            world axes.
     """
     if not contact_model(workcell).is_squeeze:
         return np.zeros((len(pose), 2, 6))
@@ -449,17 +494,17 @@ def unit_squeeze(workcell: Workcell, pose: Array, leader: int = 0) -> Array:
 def phase_use(
     workcell: Workcell, motion: PhaseMotion, force: Force, jerk: JerkLimits | None = None
 ) -> dict[str, float]:
-    """Compute the utilisation of limits that apply to every phase: largest value over its limit, by
-    name.
+    """Compute how far each limit that applies to every phase is used: the largest ratio of value to
+    limit, by name of the limit.
 
-    Torques are the sum of the arms' own and those of the commanded contact wrenches. Friction and
-    pressure are not among them: the timing checks them with the planned forces, and pressing harder
-    only improves them.
+    Joint torques are those of the arms' motion and weight plus those of the commanded contact
+    wrenches. Friction and pressure are not included: the timing checks them with the planned
+    forces, and pressing harder only reduces their use.
 
     Args:
         workcell: the workcell.
         motion, force: motion and forces of the phase.
-        jerk: jerk limits; None for none.
+        jerk: limits on jerk; None for no such limits.
     """
 
     effort = motion.own_torque + motion.contact_effort(force.wrench)
@@ -483,8 +528,17 @@ def phase_use(
 
 
 def joint_use(workcell: Workcell, q: Array, rate: Array, second: Array) -> dict[str, float]:
-    """Compute the largest position, velocity and acceleration of joints (n, joints) over their
-    limits, by name."""
+    """Compute the largest ratio of joint positions, velocities and accelerations to their limits.
+
+    Args:
+        workcell: the workcell.
+        q, rate, second: (n, joints) joint positions of both arms [rad], and their first and second
+            time derivative.
+
+    Returns:
+        Ratio by name: 'joint position', 'joint velocity', 'joint acceleration'. A position ratio of
+            0 is the middle of the joint's range, 1 an end of it.
+    """
     lower, upper = map(workcell.stack_joint_limits, ("position_lower", "position_upper"))
     return {
         "joint position": _most(np.abs(2.0 * q - lower - upper) / (upper - lower)),
@@ -496,8 +550,13 @@ def joint_use(workcell: Workcell, q: Array, rate: Array, second: Array) -> dict[
 
 
 def _jerk(time: Array, second: Array) -> Array:
-    """Compute the magnitudes (n - 1, k) of the rate of change of accelerations (n, k); infinite at
-    jumps."""
+    """Compute magnitudes (n - 1, k) of jerk between samples as differences of accelerations;
+    infinite at jumps, where two samples have the same time.
+
+    Args:
+        time: (n,) times [s].
+        second: (n, k) accelerations.
+    """
     steps, change = np.diff(time)[:, None], np.abs(np.diff(second, axis=0))
     jumps = np.where(change > _NO_JUMP, np.inf, 0.0)
     return np.where(steps > _SAME_TIME, change / np.maximum(steps, _SAME_TIME), jumps)

@@ -74,11 +74,11 @@ CHECK_STRIDE = 10
 
 @dataclass(frozen=True)
 class SupportedPose:
-    """Pose of a box on its support.
+    """Pose of the box on its support, straight below an end of the carry.
 
     Attributes:
         pose: (6,) pose of the box on the support, world frame [m, rad].
-        height: height of the carry's end above this pose [m].
+        height: distance by which the box was lowered to this pose [m].
         bodies: names of the supporting bodies; empty if there are none.
     """
 
@@ -105,16 +105,17 @@ class StraightMotions:
     def followed(
         self, workcell: Workcell, posture: NumericFunction, q: Array
     ) -> Iterator[tuple[int, Straight, Array]]:
-        """Yield side, line and joint positions of each straight motion.
-
-        The side is 0 before the carry and 1 after it. The joint positions of both arms are
-        (`PHASE_SAMPLES`, joints) [rad or m].
+        """Compute the joint positions along each straight motion, from the carry outwards.
 
         Args:
             workcell: the cell.
             posture: compiled `symbolic.robot.arm.posture_function`.
-            q: (2, joints) joint positions of both arms at the beginning and end of the carry
-                [rad or m].
+            q: (2, joints) joint positions of both arms at the beginning and end of the carry [rad
+                or m].
+
+        Yields:
+            Side (0 before the carry, 1 after it), straight motion, and joint positions of both arms
+                (`PHASE_SAMPLES`, joints) [rad or m].
 
         Raises:
             JobError: an arm does not reach a place within its joint range.
@@ -127,17 +128,18 @@ class StraightMotions:
 
 
 class JobCollisions:
-    """The collision model of one workcell's jobs. Threads must not share one.
+    """Collision model of the jobs of one workcell. Threads must not share one.
 
     Attributes:
-        geometry: bodies and pairs to check: the pairs of the carry, and each arm's bodies against
-            the box.
+        geometry: bodies, and pairs of bodies to check: the pairs of the carry, and pairs of an
+            arm's body and the box.
     """
 
     def __init__(self, compiled: CompiledCell, everywhere: bool = False) -> None:
-        """Load or build the compiled bounds.
+        """Load or build the compiled functions of the collision model.
 
         Args:
+            compiled: compiled functions of the workcell.
             everywhere: True if pads may approach from any direction, False if along their contact
                 normals.
 
@@ -149,12 +151,12 @@ class JobCollisions:
         self._functions = compiled.screening
 
     def standing(self, pose: Array, height: float | None) -> SupportedPose:
-        """Find the supported pose of the box straight below a pose (6,) [m, rad].
+        """Lower the box straight down from an end of the carry to its support.
 
         Args:
             pose: (6,) pose of the box at an end of the carry, world frame [m, rad].
-            height: distance to lower the box [m]; None to lower the box until it touches a body. If
-                no body is within `LARGEST_DROP`, the box is then not lowered.
+            height: distance by which to lower the box [m]; None to lower it until it touches a
+                body. Without a body within `LARGEST_DROP` it is then not lowered.
         """
         distances = BodyDistances(self.geometry, RESTING_TOLERANCE)
         payload, bodies = self.geometry.index(PAYLOAD_NAME), self.geometry.bodies
@@ -202,8 +204,8 @@ class JobCollisions:
         return StraightMotions(checker, lines, (before.bodies, after.bodies))
 
     def checker(self, places: Sequence[SupportedPose]) -> CollisionChecker:
-        """Build the collision checker of a job in which the box may touch its supports at the given
-        places.
+        """Build the collision checker of a job, in which the box may touch the supporting bodies at
+        the given poses.
 
         Args:
             places: supported poses of the box before and after the carry.
@@ -257,8 +259,10 @@ def job_geometry(workcell: Workcell, everywhere: bool = False) -> CellGeometry:
 
 
 def _behind_pad(body: CollisionBody, geometry: CellGeometry) -> bool:
-    """Return True if a body moves with the pads of an arm and lies behind the plane of one of them,
-    which the approach does not cross."""
+    """Return True if a body moves with the pads of an arm and lies behind the plane of one of them.
+
+    Pads that approach against their own normal do not count.
+    """
     arm, workcell = body.frame.robot, geometry.workcell
     if arm < 0 or body.frame.joint != len(geometry.arms[arm].axes) - 1:
         return False
@@ -421,8 +425,12 @@ class JobModel:
     def _around(
         self, carry: Carry, handling: Handling
     ) -> tuple[StraightMotions, list[Phase], list[Phase]]:
-        """Plan the moving phases before and after a carry, each list ordered from the carry
-        outwards. Results are cached for carries with the same ends."""
+        """Plan the straight motions before and after a carry, and time them.
+
+        Returns:
+            Straight motions, their phases before the carry, and their phases after it; each list
+                begins next to the carry. Results are cached for carries with the same ends.
+        """
         pose, q = carry.pose[[0, -1]], carry.q[[0, -1]].round(_SAME_POSTURE)
         key = handling, pose.tobytes() + q.tobytes()
         if key in self._known:
@@ -460,7 +468,12 @@ class JobModel:
     def _phases(
         self, drafts: Sequence[Phase], timing: Timing, jerk: JerkLimits | None
     ) -> Iterator[Phase]:
-        """Yield the phases in order of time, with their utilisations.
+        """Yield the phases in order of time, each with its beginning and the use of its limits.
+
+        Args:
+            drafts: phases in order of time.
+            timing: timing of the carry.
+            jerk: limits on jerk; None for no such limits.
 
         Raises:
             JobError: a phase collides or exceeds a limit.
@@ -502,13 +515,13 @@ def job_model(timing: TimingModel) -> JobModel:
 
 @dataclass(frozen=True)
 class CommandedForces:
-    """Commanded forces of a timed carry.
+    """Normal forces to command along a timed carry, with the job around the carry.
 
     Attributes:
-        forces: (n, 2) normal forces to command along the carry [N].
-        squeeze: how the forces came about.
-        job: the whole job around the carry; None if no job can be planned. The forces are then
-            computed for the carry alone.
+        forces: (n, 2) normal force of each robot at the samples of the carry [N].
+        squeeze: record of how the forces were computed.
+        job: the whole job; None if no job can be planned. The forces are then computed for the
+            carry alone.
         problem: reason why no job can be planned, else ''.
     """
 

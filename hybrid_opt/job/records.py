@@ -43,20 +43,22 @@ LARGEST_STEP = 1.0
 
 @dataclass(frozen=True, eq=False)
 class PhaseMotion:
-    """Motion of box and arms in a phase at n samples, in the world frame. Joints of both arms are
-    stacked.
+    """Motion of box and arms in one phase of a job at n samples, world frame.
 
-    At a jump of an acceleration there are two samples of the same time, with the values before and
-    after the jump.
+    Joint arrays have the columns of both arms, the first arm's first. Where an acceleration jumps
+    there are two samples of the same time, with the values before and after the jump.
 
     Attributes:
         first: number of joints of the first arm.
-        time: (n,) from the beginning of the phase [s].
-        pose, rate, second_rate: (n, 6) box pose [m, rad] and its time derivatives.
-        q, q_rate, q_second: (n, joints) joint positions [rad] and their time derivatives.
+        time: (n,) times from the beginning of the phase [s].
+        pose: (n, 6) box poses [m, rad].
+        rate, second_rate: (n, 6) first and second time derivative of the pose.
+        q: (n, joints) joint positions [rad].
+        q_rate, q_second: (n, joints) first and second time derivative of the joint positions.
         own_torque: (n, joints) joint torques of the arms' motion and weight without contacts [N m].
-        wrench_torque: (n, joints, 6) matrix that maps a robot's wrench on the box (force and moment
-            about the nominal contact point, world axes) to the robot's joint torques.
+        wrench_torque: (n, joints, 6) matrix that maps a robot's wrench on the box (force [N] and
+            moment [N m] about the robot's nominal contact point, world axes) to the robot's joint
+            torques [N m].
     """
 
     first: int
@@ -76,8 +78,13 @@ class PhaseMotion:
         return float(self.time[-1])
 
     def contact_effort(self, wrench: Array) -> Array:
-        """Compute the joint torques (n, joints) [N m] that exert wrenches (n, 2, 6) of both robots
-        on the box."""
+        """Compute the joint torques (n, joints) [N m] with which the robots exert wrenches on the
+        box.
+
+        Args:
+            wrench: (n, 2, 6) wrench of each robot, force [N] and moment about the robot's nominal
+                contact point [N m], world axes.
+        """
         return contact_torque(self.first, self.wrench_torque, np.swapaxes(wrench, 0, 1))
 
 
@@ -124,7 +131,9 @@ class Phase:
 
     @property
     def most_used(self) -> str:
-        """Name of the limit with the largest utilisation, limits of `_STATIC` excluded."""
+        """Name of the limit with the largest ratio of value to limit; limits of `_STATIC` do not
+        count.
+        """
         use = {name: ratio for name, ratio in self.use.items() if name not in _STATIC}
         return max(use, key=lambda name: use[name])
 
@@ -180,7 +189,7 @@ class Job(Displayable):
 
     @property
     def control(self) -> str:
-        """Sentence that says which arm is force controlled while the box is held."""
+        """Sentence that names the force-controlled arm while the box is held."""
         if self.follower is None:
             return "both arms keep their places"
         return f"robot {self.workcell.robots[self.follower].name!r} is force-controlled"
@@ -216,16 +225,18 @@ class Job(Displayable):
 
 @dataclass(frozen=True, eq=False)
 class SampledJob:
-    """A job at n samples, in the world frame, read-only. Joints of both arms are side by side.
+    """A job at n evenly spaced samples, world frame, read-only.
 
-    The last sample of a phase is also the first of the next phase.
+    Joint arrays have the columns of both arms, the first arm's first. The last sample of a phase is
+    also the first sample of the next phase.
 
     Attributes:
         job: the job.
-        time: (n,) from the beginning of the job [s].
+        time: (n,) times from the beginning of the job [s].
         last: index of the last sample of each phase.
         pose: (n, 6) box poses [m, rad].
-        q, q_rate, q_second: (n, joints) joint positions [rad] and their time derivatives.
+        q, q_rate, q_second: (n, joints) joint positions [rad], and their first and second time
+            derivative.
         effort: (n, joints) joint torques of the arms' motion, weight and commanded wrenches [N m].
         normal_force: (n, 2) commanded normal force of each robot [N].
         wrench: (n, 2, 6) wrench of each robot on the box about the robot's nominal contact point
@@ -247,13 +258,18 @@ class SampledJob:
         set_read_only(self)
 
     def span(self, index: int) -> slice:
-        """Return the slice of samples of the phase with this index, both ends included."""
+        """Return the slice of the samples of one phase, its first and last sample included.
+
+        Args:
+            index: index of the phase in `job.phases`.
+        """
         return slice(self.last[index - 1] if index else 0, self.last[index] + 1)
 
     @property
     def phase_names(self) -> tuple[str, ...]:
-        """Name of the phase of each sample (n,). A sample shared by two phases counts to the
-        earlier one."""
+        """Names (n,) of the phase of each sample. A sample between two phases counts to the earlier
+        one.
+        """
         names: list[str] = []
         for phase, last in zip(self.job.phases, self.last, strict=True):
             names += [phase.name] * (last + 1 - len(names))
@@ -268,10 +284,11 @@ class SampledJob:
 def sample_job(job: Job, step: float) -> SampledJob:
     """Sample a job at even time steps within each phase, from time 0.
 
-    Joints and box follow cubic Hermite pieces between the job's own samples, which are denser than
-    usual steps. Accelerations, torques and forces are interpolated linearly.
+    Joint positions and box pose are cubic Hermite interpolations of the samples of the job, which
+    are usually denser than the result. Accelerations, torques and forces are interpolated linearly.
 
     Args:
+        job: the job.
         step: time between samples [s], reduced such that whole steps fill each phase.
 
     Raises:

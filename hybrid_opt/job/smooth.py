@@ -51,13 +51,16 @@ _INSIDE = 0.01
 
 
 def has_rest_at_ends(timing: Timing) -> bool:
-    """Return True if all joints begin and end without acceleration."""
+    """Return True if all joint accelerations of a timing are zero at beginning and end, up to a
+    tolerance.
+    """
     return acceleration_at_ends(timing) <= RESTS
 
 
 def acceleration_at_ends(timing: Timing) -> float:
-    """Compute the largest joint acceleration over its limit at the beginning and end of a
-    timing."""
+    """Compute the largest ratio of a joint acceleration to its limit at the beginning and end of a
+    timing.
+    """
     carry = timing.driven
     limit = carry.workcell.stack_joint_limits("acceleration_max")
     return float((np.abs(carry.stack_arms("q_second")[[0, -1]]) / limit).max())
@@ -66,18 +69,19 @@ def acceleration_at_ends(timing: Timing) -> float:
 def without_jumps(
     model: TimingModel, timing: Timing, jerk: JerkLimits | None, width: float = SMOOTHING_WIDTH
 ) -> Timing:
-    """Compute a timing of the same path within the same limits, without jumps of the acceleration.
-    Jobs need such a timing.
+    """Compute a timing of the same path without jumps of the acceleration, within the limits of the
+    given timing. Jobs need such a timing.
 
     Args:
         model: timing model of the workcell.
         timing: drivable timing with path speeds on the grid.
-        jerk: jerk limits to satisfy; None to average the timing instead.
-        width: half the width of the averaging window [s]; zero keeps the jumps.
+        jerk: limits on jerk for a new timing of the path; None to smooth the given timing instead.
+        width: half the width of the window over which the timing is averaged [s]; zero returns the
+            given timing.
 
     Raises:
-        JobError: slowing down to half speed does not satisfy the limits, or the jerk limits cannot
-            be satisfied.
+        JobError: the smoothed timing exceeds its limits even at half speed, or the limits on jerk
+            cannot be satisfied.
     """
     if width == 0.0 or has_rest_at_ends(timing):
         return timing
@@ -90,21 +94,33 @@ def without_jumps(
 
 
 def driven_limits(model: TimingModel, x: Array) -> TimingLimits:
-    """Return the timing limits of a job's carry x (n_var,): its own force limit if the time law is
-    drivable, else the reference speeds."""
+    """Return the limits of the timing with which robots drive a carry.
+
+    If the time law is drivable, these are the limits of drivable carries with the force limit in
+    `x`; otherwise the timing is limited by the reference speeds.
+
+    Args:
+        model: timing model of the workcell.
+        x: (n_var,) decision vector of the carry.
+    """
     if model.workcell.task.law.is_drivable:
         return model.drive_limits(float(x[-1]))
     return TimingLimits(reference_speed=True)
 
 
 def driven_timing(model: TimingModel, x: Array) -> Timing:
-    """Compute the fastest timing of a job's carry x (n_var,) within `driven_limits` and the
-    workcell's limits, without jumps of acceleration. If the path has no timing, the result states
-    why.
+    """Compute the timing with which robots drive a carry: the fastest one within `driven_limits`
+    and the workcell's limits, without jumps of acceleration.
+
+    If the path has no timing, the result states why.
+
+    Args:
+        model: timing model of the workcell.
+        x: (n_var,) decision vector of the carry.
 
     Raises:
-        JobError: slowing down to half speed does not satisfy the limits, or the jerk limits cannot
-            be satisfied.
+        JobError: the smoothed timing exceeds its limits even at half speed, or the limits on jerk
+            cannot be satisfied.
     """
     limits = driven_limits(model, x)
     timing = time_path(model, x, limits)
@@ -144,8 +160,15 @@ def _smoothed(model: TimingModel, timing: Timing, width: float) -> Timing:
 
 @dataclass(frozen=True)
 class _Slowdown:
-    """A timing slowed by a factor, with its excess over limits and all ratios except friction,
-    which is fully used by construction."""
+    """A smoothed timing, slowed down by a factor.
+
+    Attributes:
+        factor: ratio of the slowed to the original speeds, at most 1.
+        timing: the slowed timing.
+        excess: largest ratio of a value to its limit, minus one.
+        columns: ratios of all values to their limits in one flat array, without friction, which
+            every timing uses fully.
+    """
 
     factor: float
     timing: Timing
@@ -154,10 +177,13 @@ class _Slowdown:
 
 
 def _fastest(driven: Callable[[float], _Slowdown]) -> _Slowdown:
-    """Find the motion with the largest factor up to 1 that satisfies the limits.
+    """Find the slowed timing with the largest factor up to 1 that satisfies the limits.
+
+    Args:
+        driven: function that slows the timing by a factor.
 
     Raises:
-        JobError: even the factor 0.5 does not satisfy the limits.
+        JobError: the limits are exceeded even with the factor 0.5.
     """
     fast = driven(1.0)
     if fast.excess <= 0.0:
@@ -181,10 +207,10 @@ def _fastest(driven: Callable[[float], _Slowdown]) -> _Slowdown:
 
 
 def _between(slow: _Slowdown, fast: _Slowdown) -> float:
-    """Estimate the factor at which the most exceeded limit is just fully used.
+    """Estimate the factor at which the limit that is exceeded most is just reached.
 
-    The estimate is linear in the square of the factor: accelerations, forces and torques are nearly
-    affine in it.
+    The estimate is linear in the square of the factor, because accelerations, forces and torques
+    are nearly affine in it.
 
     Args:
         slow: timing with a factor that satisfies the limits.
@@ -199,7 +225,15 @@ def _between(slow: _Slowdown, fast: _Slowdown) -> float:
 
 
 def _averaged(grid_speed: Array, width: float) -> tuple[Array, Array, Array]:
-    """Compute u, u' and u'' of the averaged timing, one sample every `STEPS_PER_SAMPLE` steps."""
+    """Average the path parameter u(t) of a timing over a window.
+
+    Args:
+        grid_speed: path speeds u' on a uniform grid of u [1/s].
+        width: half the width of the window [s].
+
+    Returns:
+        u, u' [1/s] and u'' [1/s^2] at samples that are `STEPS_PER_SAMPLE` averaging steps apart.
+    """
     intervals = len(grid_speed) - 1
     grid = np.linspace(0.0, 1.0, intervals + 1)
     steps = 2.0 * np.diff(grid) / (grid_speed[:-1] + grid_speed[1:])

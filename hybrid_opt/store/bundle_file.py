@@ -27,14 +27,15 @@ BUNDLE_VERSION = 2
 def write_bundle(
     folder: Path, contents: Mapping[str, str | bytes], manifest: Mapping[str, Any]
 ) -> tuple[Path, ...]:
-    """Write a bundle, or replace an older one of the same folder, in one step.
+    """Write the files and the manifest of a bundle to a folder, replacing an older bundle in one
+    step.
 
-    Everything is written beside the folder first, so that a full disk leaves the old files.
+    Everything is written next to the folder first: if the disk is full, the old files stay.
 
     Args:
         folder: folder that holds nothing but the bundle.
         contents: content of each file, by path relative to the folder.
-        manifest: JSON values by name; the digests of the files and the manifest are added.
+        manifest: JSON values by name; digests of the files and of the manifest are added.
 
     Returns:
         Paths of the written files, the manifest first.
@@ -89,7 +90,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def _require_own(folder: Path) -> None:
-    """Check that a folder which is to be replaced is a bundle as it was written.
+    """Check that a folder to be replaced holds only a bundle, unchanged since it was written.
 
     Raises:
         ResultsError: the folder holds another file; the message names the first one.

@@ -43,11 +43,11 @@ _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 @contextmanager
 def storing(path: Path, remedy: str = RESUME) -> Iterator[None]:
-    """Convert errors of the `with` block's file operations to a `ResultsError`.
+    """Convert errors of file operations in the `with` block to a `ResultsError`.
 
     Args:
         path: path of the file or folder, for the error message.
-        remedy: advice for a full disk.
+        remedy: advice that the message gives if the disk is full.
     """
     try:
         yield
@@ -64,12 +64,13 @@ def storing(path: Path, remedy: str = RESUME) -> Iterator[None]:
 
 
 def write_atomically(path: Path, content: bytes, remedy: str = RESUME) -> None:
-    """Replace a file in one step, durably; create a missing folder.
+    """Replace the content of a file in one step, so that it survives a power failure. A missing
+    folder is created.
 
     Args:
         path: path of the file.
         content: new content of the file.
-        remedy: advice for a full disk.
+        remedy: advice that the error message gives if the disk is full.
 
     Raises:
         ResultsError: the file cannot be written.
@@ -86,10 +87,10 @@ def write_json(path: Path, document: Any) -> None:
 
 
 def to_json(value: Any) -> Any:
-    """Convert a record to JSON values.
+    """Convert a dataclass record to JSON values.
 
-    Numbers that are not finite become null. Fields with the value None and the default None are
-    left out.
+    Numbers that are not finite become null. A field is left out if its value and its default are
+    both None.
     """
     if is_dataclass(value):
         return {
@@ -111,13 +112,13 @@ def to_json(value: Any) -> Any:
 def from_json(
     kind: type[Record], value: Any, path: Path | str, remedy: str, is_open: bool = True
 ) -> Record:
-    """Read a record from JSON values.
+    """Convert JSON values to a record, and check them against its annotations.
 
     Args:
         kind: class of the record.
         value: the JSON values.
         path: path of the file, or another name of the values, for error messages.
-        remedy: advice for a damaged file.
+        remedy: advice that the error message gives for a damaged file.
         is_open: True to ignore unknown keys, False to refuse them.
 
     Raises:
@@ -146,13 +147,16 @@ def read_record(kind: type[Record], path: Path, remedy: str) -> Record:
 
 
 def record_of(kind: type[Record], content: bytes, path: Path | str, remedy: str) -> Record:
-    """Read one record from the content of a JSON file.
+    """Convert the content of a JSON file to a record, and check it.
 
     Args:
         kind: class of the record.
         content: content of the file.
         path: path of the file, for error messages.
-        remedy: advice for a damaged file.
+        remedy: advice that the error message gives for a damaged file.
+
+    Raises:
+        ResultsError: the content is damaged.
     """
     return from_json(kind, json_of(content, path, remedy), path, remedy)
 
@@ -178,7 +182,16 @@ def read_json(path: Path, remedy: str = "") -> Any:
 
 
 def json_of(content: bytes, path: Path | str, remedy: str = "") -> Any:
-    """Parse the content of a JSON file; `path` and `remedy` appear in error messages."""
+    """Parse the content of a JSON file.
+
+    Args:
+        content: content of the file.
+        path: path of the file, for the error message.
+        remedy: advice that the error message gives for a damaged file.
+
+    Raises:
+        ResultsError: the content is not JSON.
+    """
     try:
         return safe_io.json_value(content)
     except OutsideError as error:
@@ -231,9 +244,8 @@ def sha256(content: bytes) -> str:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Lock a results folder for this process within a `with` block.
-
-    The lock also ends with the process.
+    """Lock a results folder for this process within a `with` block; the end of the process also
+    releases it.
 
     Raises:
         ResultsError: another process holds the lock, or the folder cannot be written.

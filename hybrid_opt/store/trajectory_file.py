@@ -62,7 +62,7 @@ class StoredTrajectory:
     Attributes:
         x: (n_var,) decision vector.
         start: joint positions (joints,) of each arm at the first sample [rad or m].
-        figures: figures of the carry by name at the time of storing, SI units.
+        figures: numbers by name that described the carry when it was stored, SI units.
         provenance: origin of the trajectory (algorithm, seed, versions, ...) as JSON values.
         cell: files of the workcell.
     """
@@ -157,8 +157,11 @@ def write_trajectory(
 
 
 def _standing_still(workcell: Workcell) -> tuple[Array, ...]:
-    """Return the inputs of the candidate function besides x; for drivable cells the timing of a
-    carry at rest, because the start postures do not depend on the timing."""
+    """Return the inputs of the candidate function that follow x.
+
+    For drivable cells it is the timing of a carry at rest, because the start postures do not depend
+    on the timing.
+    """
     if not workcell.task.law.is_drivable:
         return ()
     still = np.zeros(workcell.task.samples)
@@ -184,7 +187,7 @@ def read_trajectory(path: str | Path) -> StoredTrajectory:
 
 @dataclass(frozen=True)
 class _Content:
-    """What a file holds, as JSON values."""
+    """JSON values of a trajectory file."""
 
     format: str
     version: int
@@ -195,8 +198,12 @@ class _Content:
     cell: Any
 
     def __post_init__(self) -> None:
-        """Raise a ValueError for more or larger numbers than any cell has, and for names that are
-        not printable."""
+        """Check sizes and names.
+
+        Raises:
+            ValueError: there are more or larger numbers than any cell has, or a name is not
+                printable.
+        """
         vectors = {"decision": self.decision, "start[0]": self.start[0], "start[1]": self.start[1]}
         for name, values in (vectors | {"figures": tuple(self.figures.values())}).items():
             if len(values) > MOST_NUMBERS:
@@ -216,7 +223,13 @@ class _Content:
 
 @dataclass(frozen=True)
 class FigureComparison:
-    """A stored figure and its recomputed value, None if the figure cannot be recomputed."""
+    """A stored figure of a carry beside its recomputed value.
+
+    Attributes:
+        name: name of the figure.
+        stored: value in the trajectory file, SI units.
+        recomputed: value from a new evaluation; None if the figure cannot be recomputed.
+    """
 
     name: str
     stored: float
@@ -233,12 +246,12 @@ class FigureComparison:
 
 @dataclass(frozen=True)
 class Replay:
-    """A re-evaluated trajectory.
+    """Result of evaluating a stored trajectory again.
 
     Attributes:
         cell: the cell from the trajectory file.
-        figures: comparison of every stored figure.
-        start_difference: largest difference of the start postures [rad].
+        figures: comparison of every stored figure with its recomputed value.
+        start_difference: largest difference of a joint position at the first sample [rad].
     """
 
     cell: Cell
@@ -247,7 +260,9 @@ class Replay:
 
     @property
     def reproduced(self) -> bool:
-        """True if every stored figure and the start postures were reproduced."""
+        """True if all stored figures and the joint positions at the first sample were reproduced
+        within tolerances.
+        """
         return self.start_difference <= START_POSTURE_TOLERANCE and all(
             figure.same for figure in self.figures
         )
