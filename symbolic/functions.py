@@ -70,16 +70,18 @@ FRICTION_TOLERANCE = 1e-9
 
 
 def candidate_function(model: CellModel) -> ca.Function:
-    """Build the evaluator of one candidate: x (n_var,) to every per-sample quantity.
+    """Build the evaluator of one candidate: from the decision vector to all quantities at its n
+    samples.
 
-    Outputs (NumPy shapes, n samples): time (n,) [s]; pose (n, 6) of the box [m, rad]; rate and
-    second_rate (n, 6), the time derivatives of the pose; every output in `LOAD_OUTPUTS` except the
-    wrenches; for robot i = 1, 2 every output in `TRACK_OUTPUTS` with the suffix _i, such as q_i
-    (n, joints) [rad]; constraint (n, 9) with the columns `CONSTRAINTS`; violation (9,), the largest
-    positive value of each constraint over the samples; violation_time (9,), the share of the
-    duration during which each constraint is violated.
+    Input: x (n_var,); in drivable cells also the inputs named in `DRIVE_INPUTS`; then the cell's
+    symbolic parameters.
 
-    In drivable cells the inputs named in `DRIVE_INPUTS` follow x. The cell's parameters come last.
+    Outputs (NumPy shapes): time (n,) [s]; pose (n, 6) of the box [m, rad]; rate and second_rate (n,
+    6), the time derivatives of the pose; every output in `LOAD_OUTPUTS` except the wrenches; for
+    robot i = 1, 2 every output in `TRACK_OUTPUTS` with the suffix _i, such as q_i (n, joints)
+    [rad]; constraint (n, 9) with the columns `CONSTRAINTS`; violation (9,), the largest positive
+    value of each constraint over the samples; violation_time (9,), the share of the duration during
+    which each constraint is violated.
     """
     workcell = model.workcell
     n = workcell.task.samples
@@ -135,10 +137,9 @@ def _constraints(
 
 
 def motion_function(model: CellModel) -> ca.Function:
-    """Build the function of one candidate's motion, without forces. It does not exist for drivable
-    cells.
+    """Build the function of one candidate's motion without forces, for cells that are not drivable.
 
-    Inputs: x (n_var,), then the cell's parameters. Outputs, with shapes and units as in
+    Inputs: x (n_var,), then the cell's symbolic parameters. Outputs, with shapes and units as in
     `candidate_function`: time, pose, q_1, q_2, and violation (9,), in which the entries of friction
     and pressure are 0.
     """
@@ -188,10 +189,8 @@ states."""
 
 
 def sample_sizes(workcell: Workcell) -> dict[str, int]:
-    """Return the number of entries of each output of one sample, by the output's name.
-
-    These outputs follow the two states in the function `sample` of `sample_functions`.
-    """
+    """Return the number of entries of each output of the function `sample` of `sample_functions`
+    after the two states, by the output's name."""
     sizes = dict(_LOAD_SIZES)
     for i, robot in enumerate(workcell.robots, start=1):
         joints = robot.position_lower.shape[0]
@@ -201,32 +200,39 @@ def sample_sizes(workcell: Workcell) -> dict[str, int]:
 
 
 def forces_come_last(workcell: Workcell) -> bool:
-    """Return True if the contact model has no closed form, so that an optimisation computes the
-    forces. These are then computed only for candidates whose motion violates no constraint."""
+    """Return True if a convex program computes the contact forces. Forces are then computed only
+    for candidates whose motion violates no constraint."""
     return not contact_model(workcell).has_closed_form
 
 
 def force_sizes(workcell: Workcell) -> dict[str, int]:
-    """Return the number of entries of each output of one sample's forces, by the output's name.
-
-    These are the outputs of the function `forces` of `sample_functions`.
-    """
+    """Return the number of entries of each output of the function `forces` of `sample_functions`,
+    by the output's name."""
     torques = [f"joint_torque_{i}" for i in (1, 2)]
     sizes = _LOAD_SIZES | {name: sample_sizes(workcell)[name] for name in torques}
     return sizes | {"force_constraint": len(FORCE_CONSTRAINTS)}
 
 
 def sample_functions(model: CellModel) -> dict[str, ca.Function]:
-    """Build a candidate's function in parts, to be composed sample by sample; not for drivable
-    cells.
+    """Build the evaluation of a candidate in parts that are composed sample by sample, by name.
+    There are none for drivable cells.
 
-    path: x (n_var,) -> time (1, n), pose (6 + m, n), extended by the redundant joints, rate,
-    second_rate (6, n). start: first pose, joints of both arms there -> state_1, state_2 before the
-    first sample. predict: state_1, state_2, second pose -> both states before it. sample: pose,
-    rate, second_rate, state_1, state_2 -> next_state_1, next_state_2, then `sample_sizes`. Where
-    `forces_come_last` these are without forces, all zero, and forces: pose, rate, second_rate,
-    joints of both arms -> `force_sizes`, the last of them those entries of the constraints.
-    Numbers follow, see `kernel_numbers`.
+    path: x (n_var,) -> time (1, n); pose (6 + m, n), extended by the m redundant joints; rate and
+    second_rate (6, n).
+
+    start: first pose, joints of both arms at the start -> state_1 and state_2, each arm's state
+    before the first sample.
+
+    predict: state_1 and state_2 after the first sample, second pose -> both states with the change
+    of the joints to the second sample.
+
+    sample: pose, rate, second_rate, state_1, state_2 -> next_state_1, next_state_2, then the
+    outputs named by `sample_sizes`. Where `forces_come_last`, the outputs of forces are zero.
+
+    forces, only where `forces_come_last`: pose, rate, second_rate, joints of both arms -> the
+    outputs named by `force_sizes`.
+
+    The last inputs of each function are the parameter groups that `kernel_numbers` names.
     """
     workcell = model.workcell
     x, basis, handed = ca.MX.sym("x", workcell.task.n_var), sample_basis(workcell.task), _all(model)
@@ -277,15 +283,12 @@ def sample_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def kernel_numbers(workcell: Workcell, screen: Screen) -> dict[str, tuple[str, ...]]:
-    """Return which groups of the cell's parameters each function of `kernel_functions` takes.
+    """Return the names of the parameter groups that each function of `kernel_functions` takes as
+    its last inputs, in this order, by name of the function.
 
     Args:
-        workcell: the cell, with symbolic parameters.
-        screen: the parameters of its distance bounds, symbolic too.
-
-    Returns:
-        For each name of a function the names of the groups, in the order of the function's last
-        inputs.
+        workcell: the cell, with symbols as parameters.
+        screen: the bodies' distance bounds, with symbols as parameters.
     """
     arms, held = tuple(sx_parameters(*workcell.robots)), tuple(sx_parameters(workcell.payload))
     bodies = tuple(sx_parameters(screen))
@@ -415,9 +418,15 @@ def cell_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def branch_functions(model: CellModel) -> dict[str, ca.Function]:
-    """Build the functions that find start branches: poses, all samples (6 + m, n) of a path through
-    waypoints (6 + m, w); of each arm i = 1, 2 approach_i (`symbolic.robot.branches`) and
-    follow_i (`symbolic.robot.arm.follow_function`)."""
+    """Build the functions that find the start branches of the arms, by name.
+
+    poses: waypoints (6 + m, w) -> poses (6 + m, n), the poses of all samples, extended by the m
+    redundant joints.
+
+    approach_i, for arm i = 1, 2: inverse kinematics at the start, see `symbolic.robot.branches`.
+
+    follow_i, for arm i = 1, 2: joints along the path, see `symbolic.robot.arm.follow_function`.
+    """
     task = model.workcell.task
     waypoints = ca.SX.sym("waypoints", task.extended_size, len(task.waypoints))
     poses = waypoints @ ca.DM(sample_basis(task).position.T)
@@ -445,10 +454,10 @@ def kernel_functions(model: CellModel) -> dict[str, ca.Function]:
 def timing_functions(model: CellModel, samples: int) -> dict[str, ca.Function]:
     """Build the functions for the timing of paths in one workcell, by name.
 
-    path_motion: path geometry at uniform samples, see `symbolic.path_motion`. load, uncertain_load:
-    contact forces, see `symbolic.contact.load`. arm_1, arm_2: derivatives of an arm's motion, see
-    `symbolic.path_motion.arm_derivative_function`. path_force, only if the normal forces have
-    derivatives: see `symbolic.limit_coefficients.path_force_function`.
+    path_motion: geometry of a path at uniform samples (`symbolic.path_motion`). load,
+    uncertain_load: contact forces (`symbolic.contact.load`). path_force: normal forces and their
+    derivatives (`symbolic.limit_coefficients.path_force_function`). arm_1, arm_2: derivatives of an
+    arm's motion (`symbolic.path_motion.arm_derivative_function`).
 
     Args:
         model: the cell.

@@ -53,12 +53,13 @@ redundant joints."""
 
 
 def path_function(model: CellModel, samples: int) -> ca.Function:
-    """Build the function that computes box and arms along a path, at n uniform samples of u.
+    """Build the function of box pose and joints along a path, at n uniform samples of u, without
+    forces.
 
-    Input: x (n_path,), the path's variables [m, rad]; then the parameters of the cell.
+    Input: x (n_path,), the variables of the path [m, rad]; then the cell's symbolic parameters.
 
-    Outputs (NumPy shapes): pose, pose_first, pose_second (n, 6 + m), the box pose with the m
-    redundant joints [m, rad] and its first and second derivative by u; q_1, q_2 (n, joints), joint
+    Outputs (NumPy shapes): pose (n, 6 + m), the box pose with the m redundant joints [m, rad];
+    pose_first and pose_second, its first and second derivative by u; q_1 and q_2 (n, joints), joint
     positions [rad or m]; then for each arm i = 1, 2 ik_residual_i, lost_i, limit_margin_i and
     manipulability_i (n,), explained in `symbolic.robot.arm.TRACK_OUTPUTS`.
 
@@ -89,8 +90,12 @@ def path_function(model: CellModel, samples: int) -> ca.Function:
 
 
 def sample_limits_function(model: CellModel) -> ca.Function:
-    """Return the function from `PATH_OUTPUTS` of one sample to the coefficients of all limits
-    there, a vector laid out by `limit_layout`."""
+    """Build the function of the coefficients of all timing limits at one sample.
+
+    Inputs: `PATH_OUTPUTS` of the sample: pose and its two derivatives by u, (6 + m,) each, and the
+    joints q_1, q_2; then the symbolic parameters `limit_numbers`. Output: limits, one vector laid
+    out by `limit_layout`.
+    """
     workcell = model.workcell
     payload, task, layout = workcell.payload, workcell.task, limit_layout(workcell)
     given = [ca.SX.sym(name, task.extended_size) for name in ("pose", "first", "second")]
@@ -145,7 +150,7 @@ def sample_limits_function(model: CellModel) -> ca.Function:
 
 def limit_numbers(workcell: Workcell) -> dict[str, ca.SX]:
     """Return the symbolic parameters that `sample_limits_function` takes after its other inputs, by
-    group."""
+    name of their group."""
     return sx_parameters(workcell.task, *workcell.robots, workcell.payload)
 
 
@@ -171,14 +176,17 @@ def _contact_load(workcell: Workcell, blocks: dict[str, ca.SX], a: ca.SX, w: ca.
 
 
 def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
-    """Return both normal forces at one sample, which are convex in (u'', u'^2), and their slopes.
+    """Build the functions of both normal forces at one sample, and of their derivatives by the
+    timing.
 
-    Both take the force (9,) and moment (6,) blocks of `limit_layout` as one input, then u'' and
-    u'^2, and the payload's parameters. `limit_forces` gives (2,) [N], and the solved variables
-    (k,): the grip of soft fingers, or the state of the program that finds the forces, which then
-    are those on its central path (`symbolic.contact.soft_grasp`). `limit_force_slopes` and
-    `ratio_functions` take it last and solve nothing; `limit_force_slopes` gives the forces and
-    their derivatives (2,) by u'' and by u'^2.
+    limit_forces takes sample (15,), the blocks force and moment of `limit_layout`; a = u''; w =
+    u'^2; then the payload's symbolic parameters. It returns the normal forces (2,) [N], which are
+    convex in a and w, and the solved variables (k,): results of Newton's method for soft fingers,
+    or the state of the convex program that finds the forces.
+
+    limit_force_slopes takes the same inputs and the solved variables. It returns the forces (2,)
+    and their derivatives (2,) by a and (2,) by w. Forces of a convex program are then those on its
+    central path (`symbolic.contact.soft_grasp`).
     """
     sizes = limit_layout(workcell).sizes
     names = ("limit_forces", "limit_force_slopes")
@@ -224,9 +232,13 @@ def _load_function(workcell: Workcell) -> ca.Function:
 
 
 def path_force_function(workcell: Workcell) -> ca.Function:
-    """Return the function from the box pose and its first and second derivative by u (6,), u''
-    and u'^2 to normal_force (2,) [N] and slope (2, 2), the derivatives of each force by u'' and
-    u'^2."""
+    """Build the function of both normal forces at one point of a path, and of their derivatives by
+    the timing.
+
+    Inputs: pose, first, second (6,), the box pose and its first and second derivative by u; a =
+    u''; w = u'^2; then the payload's symbolic parameters. Outputs: normal_force (2,) [N]; slope
+    (NumPy shape (2, 2)), the derivatives of each force by a and w.
+    """
     closed, payload = contact_model(workcell).has_closed_form, workcell.payload
     kind, given = (ca.SX, sx_parameters) if closed else (ca.MX, mx_parameters)
     numbers: dict[str, Any] = dict(given(payload))
@@ -252,13 +264,16 @@ def path_force_function(workcell: Workcell) -> ca.Function:
 
 
 def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
-    """Return limits that are not convex, at one sample, and their derivatives by (u'', u'^2).
+    """Build the functions of joint torques and pressure shifts over their limits at one sample, and
+    of their derivatives by the timing. These limits are not convex in u'' and u'^2.
 
-    Both take force (9,), moment (6,), torque and wrench blocks of `limit_layout` as one input, then
-    the other inputs of `limit_force_slopes`; see `force_functions`. `limit_ratios` gives
-    `contact_limits`' ratios; `limit_slopes` gives the same and their derivatives (joints + 2,) by
-    u'' and by u'^2. If a program finds the forces, shifts of the pressure are no limit and count as
-    zero.
+    limit_ratios takes one vector, the blocks force, moment, torque and wrench of `limit_layout`; a
+    = u''; w = u'^2; the payload's symbolic parameters; and the solved variables of
+    `force_functions`. It returns the ratios (joints + 2,) of `contact_limits`.
+
+    limit_slopes takes the same inputs. It returns the ratios and their derivatives (joints + 2,) by
+    a and by w. If a convex program finds the forces, the two pressure ratios are zero: they are no
+    limit.
     """
     sizes = limit_layout(workcell).sizes
     names = ("force", "moment", "torque", "wrench")
@@ -283,18 +298,18 @@ def contact_limits(
     timing: tuple[ca.SX, ca.SX],
     implicit: ImplicitVariables,
 ) -> tuple[ca.SX, ca.SX]:
-    """Return the limited quantities of the contact forces at one sample.
+    """Compute the quantities that the contact forces limit at one sample.
 
     Args:
         workcell: the cell.
-        blocks: the blocks force, moment, torque and wrench of `limit_layout`.
+        blocks: the blocks force, moment, torque and wrench of `limit_layout`, by name.
         timing: u'' and u'^2.
-        implicit: variables that other equations determine, see `ImplicitVariables`.
+        implicit: collector of results of Newton's method, for exact derivatives.
 
     Returns:
-        Ratios (joints + 2,) to the limits: signed joint torques, then the shifts of both centres of
-        pressure over their patch radii; and the quantities (2,) of `ContactModel.force_quantities`
-        [N].
+        Ratios (joints + 2,) to the limits, first the signed joint torques of both arms, then the
+        shifts of both centres of pressure over the patch radii; and the two quantities (2,) of
+        `ContactModel.force_quantities` [N].
     """
     (a, w), joints = timing, limit_layout(workcell).joints
     model, load = contact_model(workcell), _contact_load(workcell, blocks, a, w)

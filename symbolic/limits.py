@@ -58,8 +58,8 @@ class Limit:
 
     @property
     def is_signed(self) -> bool:
-        """Return True if the limited quantity may be positive or negative, with the same limit in
-        both directions."""
+        """True if the limited quantity may be positive or negative, with the same limit in both
+        directions."""
         return self.block in ("acceleration", "torque")
 
 
@@ -187,12 +187,14 @@ LIMIT_NAMES = tuple(limit.name for limit in LIMITS)
 
 
 def limits_of_block(block: str) -> tuple[Limit, ...]:
-    """Return the limits of a block, in the order of its coefficients."""
+    """Return the limits whose coefficients lie in the block named `block`, in the order of the
+    coefficients."""
     return tuple(limit for limit in LIMITS if limit.block == block)
 
 
 def passes_enumeration() -> str:
-    """Return the C declarations of the limits and of their slack groups."""
+    """Return C source text that declares the limits and the slack group of each, for the compiled
+    passes."""
     groups = list(dict.fromkeys(limit.group for limit in LIMITS))
     names = ", ".join(limit.symbol for limit in LIMITS)
     own = ", ".join(limit.group.upper() for limit in LIMITS)
@@ -209,11 +211,11 @@ SPEEDS_OF_BOX = 4
 
 @dataclass(frozen=True)
 class BlockLayout:
-    """Layout of blocks of coefficients in a vector, one behind the other.
+    """Layout of a vector that consists of named blocks, one after the other.
 
     Attributes:
-        joints: of both arms.
-        sizes: entries per block, in order.
+        joints: number of joints of both arms together.
+        sizes: number of entries of each block by name, in the order of the vector.
     """
 
     joints: int
@@ -221,42 +223,46 @@ class BlockLayout:
 
     @property
     def offsets(self) -> dict[str, int]:
-        """Return the index of the first entry of each block, by name."""
+        """Index of the first entry of each block, by name."""
         sizes = self.sizes
         ends = np.cumsum([0, *sizes.values()]).tolist()
         return dict(zip(sizes, ends, strict=False))
 
     def block(self, name: str) -> slice:
-        """Return the slice of the block with this name."""
+        """Return the slice of the vector that holds the block `name`."""
         start = self.offsets[name]
         return slice(start, start + self.sizes[name])
 
     @property
     def size(self) -> int:
-        """Return the number of all entries."""
+        """Number of entries of the whole vector."""
         return sum(self.sizes.values())
 
 
 def limit_layout(workcell: Workcell) -> BlockLayout:
-    """Return the layout of the limits' coefficients in a sample's vector.
+    """Return the layout of the coefficients of all timing limits at one sample. All blocks except
+    force and moment are divided by the limits, so that 1 is the bound.
 
-    Blocks, in order:
+    Blocks, in order; joints counts both arms:
 
-    speed (joints + 4): demands d, each |d u'| <= 1: joints, payload, payload rotation, and the
-    reference speeds of both, which apply on request only.
+    speed (joints + 4): coefficients d of abs(d u') <= 1, for the joints, the payload, its rotation,
+    and the two reference speeds, which apply on request only.
 
-    acceleration (2, joints): alpha, beta of |alpha u'' + beta u'^2| <= 1.
+    acceleration (2, joints): coefficients alpha, then beta of abs(alpha u'' + beta u'^2) <= 1.
 
-    cone (2, 2, 3): payload's acceleration and angular acceleration, each |first u'' + second u'^2|
-    <= 1.
+    cone (2, 2, 3): vectors p and q of norm(p u'' + q u'^2) <= 1, for the payload's acceleration,
+    then for its angular acceleration.
 
-    force (3, 3): required force by u'', by u'^2 and at rest, along the axes of contact 1, the third
-    being the normal [N]. moment (2, 3): required moment about the centre of mass by u'' and by
-    u'^2, likewise [N m].
+    force (3, 3): required force by u'', by u'^2 and at rest [N], along the axes of contact 1, the
+    normal last.
 
-    torque (3, joints): the arms' own torques by u'', by u'^2 and at rest; wrench (joints, 6): from
-    the contact wrench about the nominal point, along the axes of contact 1; both over the torque
-    limits.
+    moment (2, 3): required moment about the centre of mass by u'' and by u'^2 [N m], along the axes
+    of contact 1.
+
+    torque (3, joints): joint torques of the arms without the box, by u'', by u'^2 and at rest.
+
+    wrench (joints, 6): joint torques per unit of contact wrench about the nominal contact point,
+    along the axes of contact 1.
     """
     j = sum(robot.velocity_max.shape[0] for robot in workcell.robots)
     sizes = {"speed": j + SPEEDS_OF_BOX, "acceleration": 2 * j, "cone": 12, "force": 9, "moment": 6}

@@ -73,16 +73,18 @@ torque_at_rest [N m]. wrench_torque (6 n,): the (n, 6) matrix, row by row, from 
 
 
 def path_motion_function(model: CellModel, samples: int) -> ca.Function:
-    """Return decision vector x (n_var,) -> geometry of the carry at uniform samples of u in [0, 1].
+    """Build the function of a carry's geometry at n uniform samples of the path parameter u in [0,
+    1].
 
-    Outputs (NumPy shapes, n samples): pose, pose_first and pose_second (n, 6) are the box pose and
-    its first and second derivative by u. The names in `BOX_OUTPUTS` follow. The names in
-    `symbolic.robot.arm.TRACK_OUTPUTS` (without joint_torque) and in `ARM_OUTPUTS` follow for each
-    arm i = 1, 2, with the suffix _i: for example q_1 (n, joints).
+    Input: x (n_var,), the decision vector; then the cell's symbolic parameters. Outputs (NumPy
+    shapes): pose (n, 6) of the box [m, rad]; pose_first and pose_second (n, 6), its first and
+    second derivative by u; `BOX_OUTPUTS`; then for each arm i = 1, 2
+    `symbolic.robot.arm.TRACK_OUTPUTS` (without joint_torque) and `ARM_OUTPUTS`, with the suffix _i,
+    for example q_1 (n, joints).
 
     Args:
-        model: symbolic model of the cell.
-        samples: number of samples, at least 3.
+        model: the cell.
+        samples: number n of samples, at least 3.
     """
     workcell = model.workcell
     x, task = ca.MX.sym("x", workcell.task.n_var), workcell.task
@@ -115,7 +117,13 @@ def path_motion_function(model: CellModel, samples: int) -> ca.Function:
 
 
 def start_posture(model: CellModel, arm: int, handed: Handed) -> ca.MX:
-    """Return the joints (n,) of an arm at the start of the path."""
+    """Return the joint positions (n,) [rad or m] of an arm at the start of the path.
+
+    Args:
+        model: the cell.
+        arm: index of the arm.
+        handed: inputs that hold the cell's parameters, by group; empty for plain numbers.
+    """
     start = model.start[arm]
     return (
         as_mx(start, sx_parameters(model), select_parameters(handed, model))
@@ -127,17 +135,18 @@ def start_posture(model: CellModel, arm: int, handed: Handed) -> ca.MX:
 def extended_motion(
     task: Task, x: ca.MX, basis: PathBasis, waypoints: ca.MX, handed: Handed = NONE
 ) -> list[ca.MX]:
-    """Return the extended poses and their first and second derivatives by u at n samples.
+    """Compute the extended poses (box pose, then redundant joints) at n samples of the path, and
+    their first and second derivatives by u.
 
     Args:
         task: task with m redundant joints.
         x: (n_var,) decision vector.
         basis: spline basis at the n samples.
-        waypoints: (6, n_waypoints) box poses at the waypoints.
-        handed: parameters of the task.
+        waypoints: (6, n_waypoints) box poses at the waypoints [m, rad].
+        handed: inputs that hold the task's parameters, by group; empty for plain numbers.
 
     Returns:
-        Three matrices (6 + m, n): the extended poses, their first and their second derivatives.
+        Three matrices (6 + m, n), one sample per column.
     """
     whole = extended_matrix(task, x, waypoints, handed)
     matrices = (basis.position, basis.first, basis.second)
@@ -145,10 +154,10 @@ def extended_motion(
 
 
 def box_function(workcell: Workcell) -> ca.Function:
-    """Return the function that computes `BOX_OUTPUTS` of one sample.
+    """Build the function of the box's required force, required moment and rotation at one sample.
 
-    Inputs: pose, first, second (6,), the box pose and its first and second derivative by u; then
-    the parameters of the payload.
+    Inputs: pose, first, second (6,), the box pose [m, rad] and its first and second derivative by
+    u; then the payload's symbolic parameters. Outputs: `BOX_OUTPUTS`.
     """
     pose, first, second = (ca.SX.sym(name, 6) for name in ("pose", "first", "second"))
     payload = workcell.payload
@@ -176,11 +185,17 @@ def box_function(workcell: Workcell) -> ca.Function:
 def arm_derivative_function(
     robot: Robot, model: RobotModel, contact: Contact, name: str
 ) -> ca.Function:
-    """Return the function that computes `ARM_OUTPUTS` of one sample.
+    """Build the function of an arm's joint derivatives by u and joint torques at one sample.
 
-    Inputs: q (n,), the joints with which the arm holds the box at the pose; pose, first, second
-    (6 + m,), the extended pose and its first and second derivative by u; then the parameters of
-    the robot.
+    Inputs: q (n,), the joint positions that hold the box at this pose; pose, first, second (6 +
+    m,), the extended pose and its first and second derivative by u; then the robot's symbolic
+    parameters. Outputs: `ARM_OUTPUTS`.
+
+    Args:
+        robot: description of the arm.
+        model: kinematics and dynamics of the arm.
+        contact: contact of the arm's pad with the box.
+        name: name of the function.
     """
     n = model.n_joints
     q, names = ca.SX.sym("q", n), ("pose", "first", "second")

@@ -103,10 +103,9 @@ def case_gradient_function(
     motion.
 
     Inputs and the output normal_force (2,) are those of `case_squeeze_function`. The output slope
-    (NumPy shape (2, 18)) has the derivatives of each force by pose, rate and second_rate.
-
-    If two opposite pads or holding hands have a closed form, the case must not displace the pads
-    unless `numbers` is True.
+    (NumPy shape (2, 18)) has the derivatives of each force by pose, rate and second_rate. For two
+    opposite pads and for holding hands, the case must not displace the pads unless `numbers` is
+    True.
 
     Args:
         workcell: the workcell.

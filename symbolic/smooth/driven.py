@@ -34,12 +34,12 @@ DRIVEN_FIRST, DRIVEN_SECOND = "driven_first", "driven_second"
 
 @dataclass(frozen=True)
 class DrivenLayout(BlockLayout):
-    """Layout of the quantities at a driven point in their vector.
+    """Layout of the vector of limited quantities at one point of a driven path.
 
     Attributes:
-        pose: number of entries of the extended pose.
-        by_program: True if a program computes the forces. The vector then has the load in place of
-            force, torque and pressure.
+        pose: number of entries of the extended pose, 6 + m with m redundant joints.
+        by_program: True if a convex program computes the forces. The vector then has the load in
+            place of force, torque and pressure.
     """
 
     pose: int
@@ -47,33 +47,34 @@ class DrivenLayout(BlockLayout):
 
     @property
     def variables(self) -> int:
-        """Number of variables: extended pose and both derivatives, the joints, u'' and u'^2."""
+        """Number of variables of the quantities: the extended pose, its first and second derivative
+        by u, the joints of both arms, u'' and u'^2."""
         return 3 * self.pose + self.joints + 2
 
 
 def driven_layout(workcell: Workcell) -> DrivenLayout:
-    """Return the layout of the limited quantities of a workcell: a block for each block of
-    `LIMITS`, and the load.
+    """Return the layout of the limited quantities of a workcell at one point of a driven path. All
+    quantities except force and load are divided by their limits.
 
     Blocks, in order:
 
-    speed (joints + 2): squared speeds over their squared limits, of the joints, the payload and its
-    rotation.
+    speed (joints + 2): squared speeds of the joints, of the payload and of its rotation.
 
-    acceleration (joints): joint accelerations over their limits, signed.
+    acceleration (joints): signed accelerations of the joints.
 
-    cone (2): squared lengths of the payload's acceleration and angular acceleration over their
-    squared limits.
+    cone (2): squared lengths of the payload's acceleration and of its angular acceleration.
 
-    force (2): normal component and tangential magnitude of the required force, from which the
-    paper's normal forces follow (`planned_branches`); for soft fingers both normal forces [N].
+    force (2): in the paper's model the normal component and the tangential magnitude of the
+    required force, from which the normal forces follow (`planned_branches`); for soft fingers the
+    two normal forces [N].
 
-    torque (joints): joint torques over their limits, signed.
+    torque (joints): signed joint torques.
 
-    pressure (2): shifts of the centres of pressure over their patches' radii.
+    pressure (2): shifts of the centres of pressure over the patch radii.
 
-    load (6): force and moment that the pads have to balance, about the box frame's origin [N, N m];
-    in place of force, torque and pressure if a program computes the forces.
+    load (6): force [N] and moment [N m] that the pads have to balance, about the box frame's
+    origin, along the box's axes. If a convex program computes the forces, load takes the place of
+    force, torque and pressure; otherwise load has no entries.
     """
     joints, by_program = limit_layout(workcell).joints, not contact_model(workcell).has_closed_form
     entries = {"joint": joints, "payload": 1, "robot": 2}
@@ -87,8 +88,9 @@ def driven_layout(workcell: Workcell) -> DrivenLayout:
 
 
 def planned_branches(workcell: Workcell) -> Array:
-    """Return the branches of both planned normal forces as linear combinations (2, branches,
-    quantities) of a point's quantities. There are none if a program computes the forces."""
+    """Return the coefficients (2, b, size) of b linear functions of a point's quantities (size,)
+    for each contact. The largest of a contact's functions is its planned normal force [N]; b is 0
+    if a convex program computes the forces."""
     layout, own = driven_layout(workcell), contact_model(workcell).force_branches
     if layout.by_program:
         return np.zeros((2, 0, layout.size))
@@ -98,13 +100,17 @@ def planned_branches(workcell: Workcell) -> Array:
 
 
 def driven_functions(model: CellModel) -> dict[str, ca.Function]:
-    """Build the functions of the limited quantities at a driven point, by name. With y = (pose,
-    first, second, q_1, q_2, a, w), a = u'' and w = u'^2:
+    """Build the functions of the limited quantities at one point of a driven path, by name.
 
-    driven_first: parts of y -> value (size,), slope (size, variables).
+    The variables y are, in order: pose, first and second, the extended pose and its derivatives by
+    u (6 + m,); q_1 and q_2, the joints of both arms; a = u''; w = u'^2. Each function takes them as
+    separate inputs; the cell's symbolic parameters come last.
 
-    driven_second: parts of y, weight (size,), direction (variables,) -> change (variables,): the
-    Hessian of weight . value times the direction.
+    driven_first returns value (size,), laid out by `driven_layout`, and slope (size, variables),
+    the derivatives by y (NumPy shape).
+
+    driven_second also takes weight (size,) and direction (variables,). It returns change
+    (variables,): the Hessian by y of the scalar product of weight and value, times direction.
     """
     layout = driven_layout(model.workcell)
     names = [*PATH_OUTPUTS, "a", "w"]

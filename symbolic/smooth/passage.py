@@ -65,8 +65,14 @@ payload, and of the cross products of their edges. One of these separates two di
 
 
 def direction_numbers(obstacle: Array, k: int) -> Array:
-    """Return the coefficients (DIRECTION_NUMBERS,) of direction k of an obstacle (BOX_NUMBERS,), as
-    `direction` takes them."""
+    """Return the coefficients (DIRECTION_NUMBERS,) of one separating direction, as `direction`
+    takes them.
+
+    Args:
+        obstacle: (BOX_NUMBERS,) parameters of the obstacle; the first nine are its rotation in the
+            world.
+        k: index of the direction, below SEPARATING_DIRECTIONS.
+    """
     along_obstacle, along_payload, edge, other = _SHARES[k].reshape(4, 3)
     rotation = obstacle[:9].reshape(3, 3)
     turned = rotation @ along_obstacle, rotation @ edge
@@ -74,15 +80,16 @@ def direction_numbers(obstacle: Array, k: int) -> Array:
 
 
 def direction(place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-    """Return a separating direction (3,), not normalised: an axis of the obstacle, an axis of the
-    payload, or the cross product of an edge of each. It is the sum of all three terms, of which two
-    are zero.
+    """Return a separating direction (3,) in the world frame, not normalised.
+
+    The direction is the sum of three terms, two of which are zero: an axis of the obstacle, an axis
+    of the payload, and the cross product of an edge of the obstacle and an edge of the payload.
 
     Args:
-        place: symbols of the place of the path.
-        numbers: (DIRECTION_NUMBERS,) four vectors: the obstacle's axis and the payload's axis, then
-            the obstacle's edge and the payload's edge. Those of the obstacle are in the world
-            frame, those of the payload along the payload's axes.
+        place: symbols of a place of the path.
+        numbers: (DIRECTION_NUMBERS,) four vectors (3,): axis of the obstacle, world frame; axis of
+            the payload, box frame; edge of the obstacle, world frame; edge of the payload, box
+            frame.
     """
     fixed, own, edge, other = ca.vertsplit(numbers, 3)
     turned = ca.mtimes(place.rotation, ca.horzcat(own, other))
@@ -90,11 +97,11 @@ def direction(place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
 
 
 def gap(place: PathPointSymbols, obstacle: ca.SX, numbers: ca.SX) -> ca.SX:
-    """Return the gap [m] between payload and obstacle along one separating direction, with rounded
-    kinks.
+    """Build the expression of the gap between payload and obstacle along one separating direction
+    [m], smoothed at its kinks. It is positive where the direction separates the two bodies.
 
     Args:
-        place: symbols of the place of the path.
+        place: symbols of a place of the path.
         obstacle: (BOX_NUMBERS,) parameters of the obstacle, a box.
         numbers: (DIRECTION_NUMBERS,) coefficients of the direction.
     """
@@ -104,7 +111,13 @@ def gap(place: PathPointSymbols, obstacle: ca.SX, numbers: ca.SX) -> ca.SX:
 
 @dataclass(frozen=True, order=True)
 class SeparatingAxisGap(PathConstraint):
-    """Gap of a separable pair along one direction [m]."""
+    """Constraint on the gap [m] between the payload and a box-shaped obstacle along one separating
+    direction.
+
+    Attributes:
+        pair: index of payload and obstacle among the active pairs.
+        direction: index of the separating direction, below SEPARATING_DIRECTIONS.
+    """
 
     pair: int
     direction: int
@@ -113,22 +126,36 @@ class SeparatingAxisGap(PathConstraint):
     scale: ClassVar[float] = 0.01
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Return the gap [m]."""
+        """Build the expression of the gap [m].
+
+        Args:
+            place: symbols of a place of the path.
+            numbers: (count,) parameters of the obstacle, then coefficients of the direction.
+        """
         return gap(place, numbers[:BOX_NUMBERS], numbers[BOX_NUMBERS:])
 
     def count(self, place: PathPointSymbols) -> int:
-        """Count the parameters of the obstacle and of the direction."""
+        """Return the number of parameters: BOX_NUMBERS of the obstacle and DIRECTION_NUMBERS of the
+        direction."""
         return BOX_NUMBERS + DIRECTION_NUMBERS
 
     def numbers(self, place: PathPointSymbols) -> Array:
-        """Return the parameters of the obstacle and of the direction."""
+        """Return the parameters (count,) of this constraint: those of the obstacle, then the
+        coefficients of the direction."""
         obstacle = place.obstacle(self.pair)
         return np.concatenate([obstacle, direction_numbers(obstacle, self.direction)])
 
 
 @dataclass(frozen=True, order=True)
 class AxisSwitchGap(PathConstraint):
-    """Height of the kink where the separating direction of a pair changes [m]."""
+    """Constraint on the clearance [m] at the kink where the separating direction of payload and
+    obstacle changes: the height of the kink in the module's formula.
+
+    Attributes:
+        pair: index of payload and obstacle among the active pairs.
+        before: index of the separating direction before the kink.
+        after: index of the separating direction after the kink.
+    """
 
     pair: int
     before: int
@@ -139,7 +166,14 @@ class AxisSwitchGap(PathConstraint):
     moving: ClassVar[bool] = True
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Return the height at which the lines of both gaps meet [m]."""
+        """Build the expression of the height [m] at which the two gaps, linear along the path, are
+        equal.
+
+        Args:
+            place: symbols of a place of the path near the kink.
+            numbers: (count,) parameters of the obstacle, then coefficients of the directions before
+                and after the kink.
+        """
         obstacle, both = (
             numbers[:BOX_NUMBERS],
             ca.vertsplit(numbers[BOX_NUMBERS:], DIRECTION_NUMBERS),
@@ -149,22 +183,26 @@ class AxisSwitchGap(PathConstraint):
         return (rises * before - falls * after) / (rises - falls)
 
     def count(self, place: PathPointSymbols) -> int:
-        """Count the parameters of the obstacle and of both directions."""
+        """Return the number of parameters: BOX_NUMBERS of the obstacle and DIRECTION_NUMBERS of
+        each of the two directions."""
         return BOX_NUMBERS + 2 * DIRECTION_NUMBERS
 
     def numbers(self, place: PathPointSymbols) -> Array:
-        """Return the parameters of the obstacle and of both directions."""
+        """Return the parameters (count,) of this constraint: those of the obstacle, then the
+        coefficients of the directions before and after the kink."""
         obstacle = place.obstacle(self.pair)
         both = [direction_numbers(obstacle, k) for k in (self.before, self.after)]
         return np.concatenate([obstacle, *both])
 
 
 def gap_function(place: PathPointSymbols) -> ca.Function:
-    """Build the function from pose (6,) and obstacle (BOX_NUMBERS,) to gaps
-    (SEPARATING_DIRECTIONS,) [m] along single directions, with sharp kinks.
+    """Build the function of the gaps between the payload and a box-shaped obstacle along all
+    separating directions, with exact kinks.
 
-    The largest gap is positive if the payload, a box, and the obstacle are disjoint, except for
-    nearly parallel edges. It never exceeds their distance.
+    Inputs: pose (6,) of the box; obstacle (BOX_NUMBERS,); then the symbolic parameters of the
+    bodies. Output: gaps (SEPARATING_DIRECTIONS,) [m]. The largest gap never exceeds the distance of
+    the two bodies. For a box-shaped payload it is positive if the bodies are disjoint, except where
+    edges are nearly parallel.
     """
     obstacle = ca.SX.sym("obstacle", BOX_NUMBERS)
     rotation = ca.reshape(obstacle[:9], 3, 3).T

@@ -58,13 +58,14 @@ carries lie in these kinks, and a solver makes little progress along sharp ones.
 
 
 class PathPointSymbols:
-    """Symbols of one place of the path, and expressions of them that are built once.
+    """Symbols of pose and joints at one place of the path, and expressions that are built from them
+    once.
 
     Attributes:
         model: arms and bodies of the cell.
         pose: (6,) pose of the box [m, rad].
-        rate: (6,) derivative of the pose by the path parameter.
-        q: (n,) joint positions of each arm [rad].
+        rate: (6,) derivative of the pose by the path parameter u.
+        q: for each arm the joint positions (n,) [rad, or m for a sliding joint].
     """
 
     def __init__(self, model: CellBodies) -> None:
@@ -75,17 +76,17 @@ class PathPointSymbols:
 
     @cached_property
     def rotation(self) -> ca.SX:
-        """The rotation (3, 3) of the box in the world."""
+        """Rotation R_world_box (3, 3) of the box."""
         return rotation_matrix(self.model.workcell.task.orientation, self.pose[3:])
 
     @cached_property
     def scene(self) -> DistanceBounds:
-        """Distance bounds of all bodies, with rounded kinks."""
+        """Lower bounds of the distances of all pairs of bodies, smoothed at their kinks."""
         return self._scene(Softness(KINK_WIDTH, PARALLEL_WIDTH))
 
     @cached_property
     def sharp_scene(self) -> DistanceBounds:
-        """Distance bounds of all bodies, exact."""
+        """Lower bounds of the distances of all pairs of bodies, with exact kinks."""
         return self._scene(EXACT)
 
     def _scene(self, softness: Softness) -> DistanceBounds:
@@ -94,27 +95,29 @@ class PathPointSymbols:
         return DistanceBounds(self.model.screen, *at, softness)
 
     def obstacle(self, pair: int) -> Array:
-        """Return the parameters (BOX_NUMBERS,) of the box of a separable pair."""
+        """Return the parameters (BOX_NUMBERS,) of the obstacle of an active pair `pair` from
+        `separable`; the obstacle is a box."""
         geometry = self.model.geometry
         return box_numbers(geometry.bodies[geometry.active[pair].second])
 
     def separable(self) -> tuple[int, ...]:
-        """Return the active pairs of the payload and an obstacle that is a single box."""
+        """Return the indices of the active pairs of the payload and an obstacle that is a single
+        box."""
         columns = enumerate(self.model.geometry.columns.tolist())
         return tuple(pair for pair, column in columns if self.scene.separable(column))
 
 
 @dataclass(frozen=True)
 class PathConstraint(ABC):
-    """One constraint at a place of the path.
+    """Constraint at one place of the path: a value that must exceed a required value.
 
     Constraints of one family share their compiled functions and differ only by the parameters of
     these functions.
 
     Attributes:
-        scale: divisor of the value, chosen so that 1 is significant [m, rad, 1]. In metres a solver
-            would neglect a centimetre.
-        moving: whether the value depends on the rate of the pose.
+        scale: divisor of the value [m, rad or 1], so that a change by 1 is significant. In metres a
+            solver would neglect a centimetre.
+        moving: True if the value depends on the rate of the pose.
     """
 
     scale: ClassVar[float]
@@ -131,34 +134,36 @@ class PathConstraint(ABC):
 
         Args:
             place: symbols of the box pose and the joints at one place of the path.
-            numbers: (count,) symbolic parameters, which distinguish the members of the family.
+            numbers: (count,) symbols of the parameters that distinguish the constraints of the
+                family.
         """
 
     def count(self, place: PathPointSymbols) -> int:
-        """Return the number of parameters of a member of the family."""
+        """Return the number of parameters of each constraint of the family."""
         return 0
 
     def numbers(self, place: PathPointSymbols) -> Array:
-        """Return the parameters (count,) of this member."""
+        """Return the values (count,) of this constraint's parameters."""
         return np.zeros(0)
 
     def arms(self, model: CellBodies) -> tuple[int, ...]:
-        """Return the arms on whose joints the value depends."""
+        """Return the indices of the arms on whose joints the value depends."""
         return ()
 
     def given(self, model: CellBodies) -> dict[str, ca.SX]:
-        """Return the cell's parameters on which the value depends, by group; by default those of
-        its bodies."""
+        """Return the cell's symbolic parameters on which the value depends, by name of their group.
+        By default these are the parameters of the bodies."""
         return sx_parameters(model.screen)
 
 
 @dataclass(frozen=True, order=True)
 class Clearance(PathConstraint):
-    """Smooth lower bound of the distance of an active pair [m].
+    """Constraint on the clearance of two bodies: a smooth lower bound of their distance [m].
 
     Attributes:
-        pair: index among the active pairs.
-        column: index among the possible pairs, which does not change with the cell's parameters.
+        pair: index of the two bodies among the active pairs.
+        column: index of the two bodies among the possible pairs; it does not change with the cell's
+            parameters.
     """
 
     pair: int
@@ -172,11 +177,11 @@ class Clearance(PathConstraint):
         return f"clearance_{self.column}"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Return the lower bound of the distance [m], with rounded kinks."""
+        """Build the expression of the lower bound of the distance [m]. `numbers` is empty."""
         return place.scene.bound(self.column)
 
     def arms(self, model: CellBodies) -> tuple[int, ...]:
-        """Return the arms with links in the pair."""
+        """Return the indices of the arms that have a link in the pair."""
         geometry = model.geometry
         bodies = geometry.possible[self.column]
         frames = [geometry.bodies[body].frame for body in (bodies.first, bodies.second)]
@@ -185,7 +190,14 @@ class Clearance(PathConstraint):
 
 @dataclass(frozen=True, order=True)
 class JointLimit(PathConstraint):
-    """Distance of a joint to its lower or upper limit [rad]."""
+    """Constraint on the distance of a joint to its lower or upper limit [rad, or m for a sliding
+    joint].
+
+    Attributes:
+        arm: index of the arm.
+        joint: index of the joint among the arm's joints.
+        side: 'lower' or 'upper' limit.
+    """
 
     arm: int
     joint: int
@@ -199,15 +211,22 @@ class JointLimit(PathConstraint):
         return f"joint_limit_{self.arm + 1}"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Return the margin [rad], negative beyond the limit."""
+        """Build the expression of the distance to the limit [rad or m], negative beyond the limit.
+
+        Args:
+            place: symbols of a place of the path.
+            numbers: (count,) distance at zero joint positions, then its derivatives by the joints.
+        """
         return numbers[0] + ca.dot(numbers[1:], place.q[self.arm])
 
     def count(self, place: PathPointSymbols) -> int:
-        """Return the number of parameters: a margin, and one slope per joint."""
+        """Return the number of parameters: the distance at zero joint positions, and one slope per
+        joint."""
         return 1 + int(place.q[self.arm].numel())
 
     def numbers(self, place: PathPointSymbols) -> Array:
-        """Return the margin at zero joints, then its gradient by the joints."""
+        """Return the distance to the limit at zero joint positions, then its derivatives by the
+        joints."""
         robot = place.model.workcell.robots[self.arm]
         slope = np.zeros(robot.position_lower.shape[0])
         slope[self.joint] = 1.0 if self.side == "lower" else -1.0
@@ -219,16 +238,19 @@ class JointLimit(PathConstraint):
         return (self.arm,)
 
     def given(self, model: CellBodies) -> dict[str, ca.SX]:
-        """Return an empty dictionary: the limit is a parameter of the row itself."""
+        """Return an empty dictionary: the limit itself is one of the constraint's `numbers`."""
         return {}
 
 
 @dataclass(frozen=True, order=True)
 class ManipulabilityLimit(PathConstraint):
-    """Value (|det J| / least)^2 - 1 of an arm, with the least allowed |det J|.
+    """Constraint on the manipulability of an arm: the value (D / D_min)^2 - 1 with D, the absolute
+    determinant of the Jacobian, and its least allowed value D_min.
 
-    At the edge of the reach the determinant falls like a root of the distance; its square falls
-    linearly.
+    At the edge of the reach D falls like a root of the distance; its square falls linearly.
+
+    Attributes:
+        arm: index of the arm.
     """
 
     arm: int
@@ -241,7 +263,8 @@ class ManipulabilityLimit(PathConstraint):
         return f"reach_{self.arm + 1}"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Return the value, which is zero at the least manipulability of the workcell."""
+        """Build the expression of the value, dimensionless; it is zero at the least manipulability
+        that the workcell allows. `numbers` is empty."""
         least = place.model.workcell.robots[self.arm].min_manipulability
         model = place.model.robots[self.arm]
         jacobian = following_columns(model, model.jacobian(place.q[self.arm]))
@@ -252,31 +275,35 @@ class ManipulabilityLimit(PathConstraint):
         return (self.arm,)
 
     def given(self, model: CellBodies) -> dict[str, ca.SX]:
-        """Return the symbols of the arm."""
+        """Return the arm's symbolic parameters by name of their group."""
         return sx_parameters(model.workcell.robots[self.arm])
 
 
 def row_name(family: str, order: Order) -> str:
-    """Return the name of the function that `row_function` builds for a family."""
+    """Return the name of the function that `row_function` builds for a family of constraints, with
+    derivatives of order 'first' or 'second'."""
     return f"row_{family}_{order}"
 
 
 def closure_name(arm: int, order: Order) -> str:
-    """Return the name of the function that `closure_functions` builds for an arm."""
+    """Return the name of the function that `closure_functions` builds for the arm with index `arm`,
+    with derivatives of order 'first' or 'second'."""
     return f"closure_{arm + 1}_{order}"
 
 
 def row_function(place: PathPointSymbols, constraint: PathConstraint, order: Order) -> ca.Function:
-    """Build the function of the value and gradient, or of the Hessian, of a family of constraints.
+    """Build the function of a family of constraints and its derivatives at one place of the path.
 
-    The variables y are the pose, then the rate if the constraint is `moving`, then the joints of
-    its `arms`.
+    The variables y (n_y,) of the derivatives are the pose (6,), then its rate (6,) if the
+    constraint is `moving`, then the joints of its `arms`. Inputs: pose, rate, q_1, q_2; numbers,
+    the constraint's parameters, if the family has any; weight, a scalar, for the second order; then
+    the cell's symbolic parameters.
 
-    first: pose, rate, q_1, q_2, numbers -> value, gradient (n_y,).
-
-    second: pose, rate, q_1, q_2, numbers, weight -> weight times the Hessian (n_y, n_y).
-
-    A family with one member has no numbers. The cell's own parameters follow.
+    Args:
+        place: symbols of a place of the path.
+        constraint: any constraint of the family.
+        order: 'first' for the outputs value (scalar) and gradient (n_y,); 'second' for the output
+            hessian (n_y, n_y), multiplied by weight.
     """
     numbers = ca.SX.sym("numbers", constraint.count(place))
     value = constraint.expression(place, numbers)
@@ -296,13 +323,19 @@ def row_function(place: PathPointSymbols, constraint: PathConstraint, order: Ord
 
 
 def closure_functions(model: CellModel, arm: int) -> dict[str, ca.Function]:
-    """Build the functions with which an arm's joints follow the box pose, by name. The symbols are
-    those of the module's formulas.
+    """Build the functions with which an arm's joints follow the box pose, by name. The symbols F, c
+    and nu are those of the module's formulas; the robot's symbolic parameters are the last inputs.
 
-    first: pose (6 + m,) and q_reference (n,) -> q (n,), the joints that hold the box; follow (n, 6
-    + m), the derivative dq/dpose; pull (n, n), the matrix -F_q^-1, so that nu = pull^T c_q.
+    first: takes pose (6 + m,) with the m redundant joints, and q_reference (n,), joint positions
+    near the solution. It returns q (n,), the joint positions that hold the box; follow (n, 6 + m),
+    the derivative dq/dpose; and pull (n, n), the matrix -F_q^-1, so that nu = pull^T c_q.
 
-    second: pose, q and nu (n,) -> hessian (6 + m + n, 6 + m + n) of nu . F by (pose, q).
+    second: takes pose, q and nu (n,). It returns hessian (6 + m + n, 6 + m + n), the second
+    derivatives of nu . F by pose and q.
+
+    Args:
+        model: the cell.
+        arm: index of the arm.
     """
     own = model.robots[arm]
     n = own.n_joints

@@ -72,23 +72,26 @@ DIFFERENCE_WINDOW = 5
 
 
 def sample_name(quantity: Quantity, block: Block, order: Order) -> str:
-    """Return the name of the function that `sample_functions` builds for a block."""
+    """Return the name of the function that `sample_functions` builds for a quantity and a block of
+    samples, with derivatives of order 'first' or 'second'."""
     return f"{quantity}_{block}_{order}"
 
 
 def grasp_force_name(order: Order) -> str:
-    """Return the name of the function that `grasp_force_functions` builds."""
+    """Return the name of the function that `grasp_force_functions` builds for the order 'first' or
+    'second'."""
     return f"held_{order}"
 
 
 @dataclass(frozen=True)
 class SampleBlock:
-    """Samples that share one function.
+    """Samples that are evaluated by calls of one function.
 
     Attributes:
-        block: name of the function's block.
-        samples: (calls, k) indices of the k samples of each call.
-        basis: (calls, width, n_waypoints) basis rows of each call's window.
+        block: name of the block.
+        samples: (calls, k) indices of the k samples that each call evaluates.
+        basis: (calls, width, n_waypoints) for each call the matrix from waypoints to the poses of
+            the call's window of samples.
     """
 
     block: Block
@@ -97,7 +100,8 @@ class SampleBlock:
 
 
 def sample_blocks(task: Task) -> tuple[SampleBlock, ...]:
-    """Divide the task's samples into blocks, one for each function."""
+    """Divide the samples of a task into blocks; all samples of a block are evaluated by one
+    function."""
     n, position = task.samples, sample_basis(task).position
     if not task.law.has_differences:
         return (SampleBlock("path", np.arange(n)[None, :], position[None]),)
@@ -113,20 +117,24 @@ def sample_blocks(task: Task) -> tuple[SampleBlock, ...]:
 
 
 def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[str, ca.Function]:
-    """Build the functions of a quantity at samples and of its derivatives, by name, for every block
-    of `sample_blocks`. There are w = QUANTITY_WIDTHS[quantity] values per sample.
+    """Build the functions of a quantity at samples and of its derivatives by the decision vector,
+    for every block of `sample_blocks`, by name. A sample has w = QUANTITY_WIDTHS[quantity] values.
 
-    Inputs of a block of k samples: x (n_var,), basis (n_waypoints, width) of the window, and the
-    rounding of `timed_path`. The latter two have no effect if the block is the whole path.
+    Inputs for a block of k samples: x (n_var,), the decision vector; basis (n_waypoints, width),
+    the transposed matrix of `SampleBlock.basis`; rounding, the scalar of `timed_path`; then the
+    cell's symbolic parameters. In the block 'path' basis and rounding have no effect.
 
-    first: x, basis, rounding -> values (w k,), all of the first sample, all of the second, ..., and
-    gradient (n_var, w k), one column per value.
+    first: returns values (w k,), sample by sample, and gradient (n_var, w k), one column per value.
 
-    second: x, basis, rounding, weight (w k,), along (n_var,) -> curvature (n_var,), the Hessian of
-    weight . values times along.
+    second: also takes weight (w k,) and along (n_var,). It returns curvature (n_var,), the Hessian
+    of the scalar product of weight and values, times along.
 
-    With one direction per call the code of second derivatives is a tenth as long as for a whole
-    Hessian. Lanes evaluate the columns side by side, and the code stays in the processor's cache.
+    One direction per call makes the code of second derivatives ten times shorter than a whole
+    Hessian, so that it stays in the processor's cache.
+
+    Args:
+        workcell: the cell.
+        quantity: 'force', 'pressure' or 'load'.
     """
     makers = {"force": _force_function, "pressure": _margin_function, "load": _load_function}
     sample = makers[quantity](workcell)
@@ -142,12 +150,19 @@ def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[str, ca.Fun
 def grasp_force_functions(
     workcell: Workcell, weight: float = SAMPLE_BARRIER_WEIGHT
 ) -> dict[str, ca.Function]:
-    """Build the functions of normal forces without closed form, which are smooth convex functions
-    of a sample's load at a weight of the barriers (`symbolic.contact.soft_grasp`), by name:
+    """Build the functions of normal forces that a convex program computes, by name. With a positive
+    weight of the barriers the forces are smooth functions of the load.
 
-    first: load (6,) -> normal (2,) [N], slope (6, 2), state (n,) for the second.
+    first: takes load (6,), force [N] and moment [N m] about the box frame's origin. It returns
+    normal (2,), normal forces of the robots [N]; slope (6, 2), their derivatives by the load; and
+    state (n,), an input of second.
 
-    second: state, weight (2,) -> curvature (6, 6), the Hessian of weight . normal by the load.
+    second: takes state and weight (2,), one number per normal force. It returns curvature (6, 6),
+    the Hessian by the load of the weighted sum of the normal forces.
+
+    Args:
+        workcell: cell with the pads.
+        weight: weight of the barriers over the effort (`symbolic.contact.soft_grasp`).
 
     Raises:
         SettingsError: the pads do not close their grasp.
@@ -157,9 +172,13 @@ def grasp_force_functions(
 
 
 def motion_function(task: Task) -> ca.Function:
-    """Build the function from x (n_var,) to motion (n, 18), the box pose, rate and second rate at
-    every sample, and slope (18 n, n_var), the derivatives of its entries row by row. Shapes are
-    NumPy's."""
+    """Build the function of the box motion at all n samples and its derivatives by the decision
+    vector.
+
+    Input: x (n_var,). Outputs (NumPy shapes): motion (n, 18), the box pose (6,), its rate and its
+    second rate at each sample; slope (18 n, n_var), the derivatives of motion's entries, row by
+    row.
+    """
     x = ca.MX.sym("x", task.n_var)
     path = timed_path(task, sample_basis(task), waypoint_matrix(task, x))
     motion = ca.vertcat(path.pose, path.rate, path.second_rate)
