@@ -1,13 +1,13 @@
 """Collision check of motions between samples, by motion bounds and adaptive subdivision.
 
-A pair of bodies with clearances c_a and c_b at the two ends of an interval keeps a distance of at
-least
+A pair of bodies with distances of at least c_a and c_b at the two ends of an interval keeps a
+distance of at least
 
   (c_a + c_b - D) / 2 - K / 8       and of at least       max(c_a, c_b) - D - K / 8
 
-inside the interval, with D and K the chords and bends of both bodies
-(`symbolic.geometry.clearance`). If neither bound exceeds the tolerance, the interval is halved. If
-the compiled clearance is too small, a measured distance takes its place.
+inside the interval. D and K are the sums over both bodies of the chords and bends that
+`symbolic.geometry.clearance` defines. If neither bound exceeds the tolerance, the interval is
+halved. Where compiled bounds of c_a and c_b are too small, measured distances replace them.
 """
 
 from __future__ import annotations
@@ -41,9 +41,10 @@ class MotionVerdict:
     """Result of the check of one motion between its samples.
 
     Attributes:
-        status: 'free' if proven; 'collision' if FCL found one; 'undecided' if a clearance is too
-            small for a proof.
-        touch: the earliest collision, else the earliest undecided interval, else None.
+        status: 'free' if proven; 'collision' if two bodies collide; 'undecided' if a distance is
+            too small for a proof.
+        touch: the earliest collision, or the earliest undecided interval if nothing collides; None
+            if free.
     """
 
     status: Status
@@ -68,18 +69,27 @@ class SampledMotions:
 
 
 def check_all_between(checker: CollisionChecker, sampled: SampledMotions) -> list[MotionVerdict]:
-    """Check motions between their samples, which must be free of collisions. Box pose and joints
-    move linearly between samples."""
+    """Check motions for collisions between their samples.
+
+    The samples must be free of collisions. Box pose and joints move linearly between them.
+
+    Args:
+        checker: collision checker of the workcell.
+        sampled: the samples of all motions.
+
+    Returns:
+        One verdict per motion.
+    """
     return _Sweep(checker, sampled).run()
 
 
 class _Sweep:
-    """Adaptive subdivision of the intervals of all motions together.
+    """Adaptive subdivision of the intervals between samples, for all motions together.
 
     Attributes:
         owner: (n_intervals,) index of the motion of each interval.
         first: (n_motions,) index of the first interval of each motion.
-        required: (n_motions, n_pairs) clearance that bodies have to keep [m].
+        required: (n_motions, n_pairs) distance that the pairs have to keep [m].
     """
 
     def __init__(self, checker: CollisionChecker, sampled: SampledMotions) -> None:
@@ -122,7 +132,13 @@ class _Sweep:
     def _verdict(
         self, motion: int, hits: list[CollidingPair], left: list[CollidingPair]
     ) -> MotionVerdict:
-        """Return the verdict on one motion. Its samples are counted from its own first sample."""
+        """Return the verdict on one motion, with samples counted from the motion's first sample.
+
+        Args:
+            motion: index of the motion.
+            hits: collisions of all motions.
+            left: undecided intervals of all motions.
+        """
         kinds: tuple[tuple[Status, list[CollidingPair]], ...] = (
             ("collision", hits),
             ("undecided", left),
@@ -136,10 +152,10 @@ class _Sweep:
         return MotionVerdict("free", None)
 
     def _first_intervals(self) -> Intervals:
-        """Return the intervals between samples that the motion bound does not clear.
+        """Return the intervals between samples for which motion bounds give no proof.
 
-        Motions are handled one by one: nearly all intervals are cleared, and arrays over all of
-        them would not stay in the cache.
+        Motions are handled one by one: nearly all intervals are proven free, and arrays over all of
+        them would not stay in the processor's cache.
         """
         found = []
         for motion, count in enumerate(self.sampled.lengths):
@@ -170,11 +186,10 @@ class _Sweep:
         return Intervals(index, start, width, a, b, *self.checker.motion(*ends), pending)
 
     def _uncleared(self, work: Intervals) -> Intervals:
-        """Return the intervals that still have a pair without a proof of its clearance.
+        """Return the intervals in which a pair is not yet proven to keep the required distance.
 
-        A pair is proven clear in an interval if its clearances at both ends, less the longest way
-        that its bodies can move in between, exceed the required clearance. Proven pairs are no
-        longer `pending`.
+        The proof is one of the two bounds in the description of this module. Pairs with a proof are
+        no longer `pending`.
         """
         c_a, c_b = work.a.clearance, work.b.clearance
         halfway = c_a + c_b
@@ -189,16 +204,25 @@ class _Sweep:
         return replace(work, pending=pending)[left]
 
     def _required(self, work: Intervals) -> Array:
-        """Return the clearance [m] that pairs have to keep in the intervals: (m, n_pairs), or (1,
-        n_pairs) if all intervals belong to one motion."""
+        """Return the distance that pairs have to keep in m intervals, (m, n_pairs) [m].
+
+        The shape is (1, n_pairs) if all intervals belong to one motion.
+        """
         owners = self.owner[work.index]
         if len(owners) and owners[0] == owners[-1] and (owners == owners[0]).all():
             return self.required[owners[:1]]
         return self.required[owners]
 
     def _given_up(self, work: Intervals, level: int) -> NDArray[np.bool_]:
-        """Return a mask (m,) of the intervals that stay undecided: at the last level all; before it
-        those with an end at which a pair is closer than required, so that no proof can succeed."""
+        """Return True for each of m intervals that stays undecided.
+
+        At the last level these are all intervals. From `HOPELESS_DEPTH` on they are those with a
+        pair that is closer than required at an end, so that no proof can succeed.
+
+        Args:
+            work: the m intervals.
+            level: number of times that the intervals have been halved.
+        """
         hopeless = np.full(len(work.index), level == DEPTH)
         if HOPELESS_DEPTH <= level < DEPTH:
             required = self.required[self.owner[work.index]]
@@ -210,11 +234,17 @@ class _Sweep:
         return hopeless
 
     def _measure(self, work: Intervals, end: End, last: bool) -> NDArray[np.intp]:
-        """Replace bounds at one end of the intervals by measured distances where halving would take
-        too long.
+        """Measure distances at one end of m intervals where halving would take too long.
+
+        The measured distances replace the bounds in `end`.
+
+        Args:
+            work: the intervals.
+            end: one end of the intervals.
+            last: True to measure all pending pairs.
 
         Returns:
-            (m,) the first colliding pair at each end, or -1.
+            (m,) index of the first colliding pair at each end, or -1.
         """
         beyond = end.clearance - self._required(work)
         hopeless = ~(beyond > HALVING_WINS * work.chord)
@@ -244,7 +274,7 @@ class _Sweep:
 
 
 class Rows:
-    """A record of arrays with one row per item; its fields may be such records themselves."""
+    """A record of arrays with one row per item. A field may be such a record itself."""
 
     def __getitem__(self, rows: NDArray[np.bool_]) -> Self:
         return of_rows(lambda values: values[0][rows], [self])
@@ -254,7 +284,12 @@ AnyRows = TypeVar("AnyRows", bound=Rows)
 
 
 def of_rows(made_of: Callable[[list[Any]], Any], records: Sequence[AnyRows]) -> AnyRows:
-    """Combine records field by field, by a function from a list of arrays to one array."""
+    """Combine several records of one type into one record, field by field.
+
+    Args:
+        made_of: function from the list of a field's arrays to the combined array.
+        records: the records.
+    """
     parts = zip(*(vars(record).values() for record in records), strict=True)
     values = [
         of_rows(made_of, part) if isinstance(part[0], Rows) else made_of(list(part))
@@ -268,7 +303,7 @@ class End(Rows):
     """One end of m intervals.
 
     Attributes:
-        configuration: (m, 6 + all joints) pose, q_1, q_2.
+        configuration: (m, 6 + all joints) box poses and joints of both arms.
         clearance: (m, n_pairs) lower bounds of the distances [m]; measurements raise them in place.
         measured: (m, n_pairs) True where a distance was measured.
     """
@@ -280,7 +315,15 @@ class End(Rows):
 
 @dataclass(frozen=True)
 class Intervals(Rows):
-    """The intervals still to be checked: both ends, and the pairs that are still open."""
+    """m intervals that are not yet proven free.
+
+    Attributes:
+        index: (m,) index of the interval between samples that contains the interval.
+        start, width: (m,) start and width as shares of this interval between samples, 0 to 1.
+        a, b: the two ends.
+        chord, bend: (m, n_pairs) bounds of the relative motion of each pair [m].
+        pending: (m, n_pairs) True for pairs without a proof.
+    """
 
     index: NDArray[np.intp]
     start: Array
@@ -292,8 +335,10 @@ class Intervals(Rows):
     pending: NDArray[np.bool_]
 
     def hand_on(self) -> None:
-        """Copy measurements from the end of an interval to the start of the next one, if both are
-        the same configuration."""
+        """Copy measured distances from the end of an interval to the start of the next interval.
+
+        This is done only if both have the same configuration.
+        """
         same = np.all(self.b.configuration[:-1] == self.a.configuration[1:], axis=1)
         before = np.flatnonzero(same)
         after = before + 1

@@ -1,9 +1,9 @@
-"""Continuous certification: the proof that a path is free of collisions throughout.
+"""Proofs that paths are free of collisions everywhere, not only at their samples.
 
-`certify_all` proves this for any continuous paths. A search checks candidates on the task's samples
-only. The carries that it returns (fronts, selected and polished trajectories) are certified along
-the continuous path: `configurations` computes any place of the path by Newton's method,
-`certificates` gives the proofs.
+A search checks candidates at the task's samples only. The carries that it returns (fronts, selected
+and polished trajectories) are certified along the continuous path. `certify_all` makes the proof
+for any continuous paths. `configurations` computes box pose and joints anywhere on a path by
+Newton's method, and `certificates` certifies carries.
 """
 
 from __future__ import annotations
@@ -61,11 +61,13 @@ class Certificate:
         is_free: whether the path is proven free of collisions, under the assumption of
             `certify_all`.
         at_sample: a collision at a grid point, or None.
-        at_parameter: path parameter of the earliest collision or undecided place; NaN if free.
-        motion: the verdict between the grid points; None if a grid point collides.
+        at_parameter: path parameter of the earliest collision or undecided place, or where an arm
+            loses the path; NaN if free.
+        motion: the verdict between the grid points; None if a grid point collides or is lost.
         grid_points: number of grid points.
-        deviation: largest measured distance of a pair from straight motion between grid points [m].
-        lost: whether an arm loses the path, at `at_parameter`.
+        deviation: largest measured deviation of a pair from straight motion between grid points
+            [m].
+        lost: whether an arm does not reach its contact at `at_parameter`.
     """
 
     is_free: bool
@@ -100,10 +102,12 @@ def certify(
     configuration: Configuration,
     parameters: Array,
 ) -> Certificate:
-    """Certify one path as `certify_all` does.
+    """Certify that one path is free of collisions, as `certify_all` does.
 
     Args:
-        configuration: gives the configuration at any path parameter.
+        checker: collision checker of the workcell.
+        configuration: function from path parameters (n,) to box poses (n, 6) and joint positions
+            (n, joints) of each arm.
         parameters: (n,) increasing path parameters of the first grid.
 
     Raises:
@@ -125,13 +129,15 @@ def certify_all(
 
     The grid of each path is refined until, in the middle of every interval, each pair of bodies is
     within `STRAIGHTNESS` of straight motion (linear in joints and box pose). Adaptive subdivision
-    then checks the straight motion with a margin of twice the largest such distance. The proof
-    holds for every path whose largest distance from straight motion in an interval is at most twice
-    the distance in the middle. A path that is smooth on the grid satisfies this.
+    then checks the straight motion with a margin of twice the largest deviation. The proof assumes
+    that the largest deviation inside an interval is at most twice the deviation in its middle. A
+    path that is smooth on the grid satisfies this.
 
     Args:
-        configurations: gives the configuration of any path at any path parameter.
-        parameters: for every path (n,) increasing path parameters of the first grid.
+        checker: collision checker of the workcell.
+        configurations: function from path indices (n,) and path parameters (n,) to configurations
+            (n, 6 + all joints).
+        parameters: for every path the increasing path parameters (n,) of its first grid.
 
     Raises:
         SettingsError: a path does not become straight on any grid.
@@ -162,8 +168,8 @@ class _Grid:
     Attributes:
         owner: (n,) index of the path of each point, increasing.
         u: (n,) path parameter of each point, increasing along each path.
-        configuration: (n, 6 + all joints).
-        deviation: (n_paths,) largest measured distance from straight motion [m].
+        configuration: (n, 6 + all joints) box pose and joints of both arms at each point.
+        deviation: (n_paths,) largest measured deviation from straight motion [m].
     """
 
     owner: NDArray[np.intp]
@@ -174,7 +180,13 @@ class _Grid:
 
 @dataclass(frozen=True)
 class _Stretches(Rows):
-    """Intervals of paths with the configurations at both ends."""
+    """Intervals of paths with the configurations at both ends.
+
+    Attributes:
+        owner: (m,) index of the path of each interval.
+        u_a, u_b: (m,) path parameters at start and end.
+        a, b: (m, 6 + all joints) configurations at start and end.
+    """
 
     owner: NDArray[np.intp]
     u_a: Array
@@ -188,8 +200,10 @@ def _straight_grid(
     configurations: Configurations,
     parameters: Sequence[Array],
 ) -> _Grid:
-    """Refine the grids as `certify_all` describes. Intervals are not refined at a place where an
-    arm loses the path."""
+    """Refine the grids of all paths as `certify_all` describes.
+
+    An interval in whose middle an arm loses the path is not refined.
+    """
     owner = np.repeat(np.arange(len(parameters)), [len(u) for u in parameters])
     u = np.concatenate([np.asarray(grid, dtype=float) for grid in parameters])
     placed = configurations(owner, u)
@@ -224,8 +238,12 @@ def _straight_grid(
 
 
 def _farthest(checker: CollisionChecker, configuration: Array, other: Array) -> Array:
-    """Compute for each row (n,) the largest chord [m] of any pair between two configurations (n, 6
-    + all joints). Few rows are computed at a time, so that they stay in the cache."""
+    """Compute the largest chord of any pair between two configurations, (n,) [m].
+
+    Args:
+        checker: collision checker of the workcell.
+        configuration, other: (n, 6 + all joints) the two configurations of each row.
+    """
     off = np.empty(len(configuration))
     for start in range(0, len(off), CACHED_ROWS):
         some = slice(start, start + CACHED_ROWS)
@@ -237,8 +255,16 @@ def _farthest(checker: CollisionChecker, configuration: Array, other: Array) -> 
 def _failed_on_grid(
     checker: CollisionChecker, grid: _Grid, path: int, clearance: Array
 ) -> Certificate | None:
-    """Return the certificate of a path that an arm loses or that collides at a grid point, else
-    None."""
+    """Return the certificate of a path that fails at a grid point; None for other paths.
+
+    A path fails where an arm does not reach its contact or bodies collide.
+
+    Args:
+        checker: collision checker of the workcell.
+        grid: grid points of all paths.
+        path: index of the path.
+        clearance: (n, n_pairs) lower bounds of distances at all grid points [m].
+    """
     # In order of their owners: a slice, of which nothing is copied.
     rows = slice(*np.searchsorted(grid.owner, [path, path + 1]).tolist())
     u, placed = grid.u[rows], grid.configuration[rows]
@@ -267,7 +293,7 @@ class LostPathError(DualArmError):
 
 @dataclass(frozen=True)
 class SampledPath:
-    """The path of a carry on its samples, from which Newton's method reaches any other place.
+    """The samples of a carry's path, from which Newton's method computes the path between them.
 
     Attributes:
         task: the task of the carry.
@@ -285,7 +311,7 @@ class SampledPath:
 def configurations(
     paths: Sequence[SampledPath], posture: NumericFunction, owner: NDArray[np.intp], u: Array
 ) -> Array:
-    """Compute configurations at any places of paths, between their samples.
+    """Compute box pose and joint positions anywhere on sampled paths.
 
     Args:
         paths: sampled paths of one task.
@@ -320,7 +346,13 @@ def configurations(
 def certificates(
     checker: CollisionChecker, posture: NumericFunction, paths: Sequence[SampledPath]
 ) -> list[Certificate]:
-    """Certify carries of one task whose samples are free of collisions."""
+    """Certify carries of one task whose samples are free of collisions.
+
+    Args:
+        checker: collision checker of the workcell.
+        posture: compiled `symbolic.robot.arm.posture_function`.
+        paths: the sampled path of each carry.
+    """
     found: list[Certificate] = []
     for first in range(0, len(paths), TOGETHER):
         some = paths[first : first + TOGETHER]

@@ -1,9 +1,9 @@
-"""The collision verdict on a candidate: compiled bounds and proofs first, FCL for pairs that these
-leave open.
+"""Collision verdicts on candidates, by compiled bounds and proofs first, and FCL for the other
+pairs.
 
-The rule is the same with or without bounds: bodies collide if FCL finds an intersection, or if
-their distance is at most the tolerance. Bounds and proofs decide only pairs that are farther from
-this border than FCL's resolution. Near contact FCL alone decides.
+Two bodies collide if FCL finds an intersection, or if their distance is at most the tolerance.
+Bounds and proofs decide only pairs whose distance differs from the tolerance by more than FCL's
+resolution, so they do not change any verdict. Near contact FCL alone decides.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ class CollidingPair:
     """Two bodies that collide, or that are too near for a proof that they do not.
 
     Attributes:
-        sample: index of the sample, or of the sample before the place.
+        sample: index of the sample at which they collide, or of the sample before.
         first, second: names of the bodies.
-        fraction: position of the place between this sample and the next, 0 to 1.
+        fraction: place between this sample (0) and the next sample (1).
     """
 
     sample: int
@@ -79,8 +79,9 @@ class CollisionChecker:
         judge: FCL objects of these bodies.
         functions: `symbolic.geometry.clearance.screening_functions`, compiled or interpreted.
         free_beyond: (n_pairs,) a pair is free if its lower bound exceeds this distance [m].
-        resting_places: for each allowed contact and each fixed pose that touches the body: index of
-            the pair, box centre (3,) [m], and departure [m].
+        resting_places: places at which the payload may rest on a body of the environment, one for
+            each allowed contact and fixed pose that touches the body: index of the pair, box centre
+            (3,) [m], and departure [m].
     """
 
     def __init__(self, geometry: CellGeometry, functions: Mapping[str, NumericFunction]) -> None:
@@ -118,7 +119,7 @@ class CollisionChecker:
 
     @cached_property
     def tables(self) -> tuple[JointTable, ...]:
-        """Tables of lower bounds of active pairs over joint positions."""
+        """Tables of lower bounds of some active pairs by joint positions."""
         return joint_tables(self.geometry)
 
     def check(self, pose: Array, q_1: Array, q_2: Array, clearance: Array | None = None) -> Verdict:
@@ -127,7 +128,8 @@ class CollisionChecker:
         Args:
             pose: (n, 6) box poses [m, rad].
             q_1, q_2: (n, joints) joint positions [rad].
-            clearance: (n, n_pairs) lower bounds of distances [m]; computed if None.
+            clearance: (n, n_pairs) lower bounds of the active pairs' distances [m]; None to compute
+                them.
         """
         if clearance is None:
             clearance = self.bounds(pose, q_1, q_2)
@@ -155,13 +157,13 @@ class CollisionChecker:
         rows: NDArray[np.intp],
         pairs: NDArray[np.intp],
     ) -> NDArray[np.bool_]:
-        """Decide for m chosen pairs whether they collide.
+        """Decide whether pairs of bodies collide, for m queries of one pair at one sample each.
 
         Args:
             pose: (n, 6) box poses [m, rad].
             q_1, q_2: (n, joints) joint positions [rad].
             rows: (m,) index of the sample of each query, increasing.
-            pairs: (m,) index of the pair of each query.
+            pairs: (m,) index of the active pair of each query.
 
         Returns:
             (m,) True for pairs that collide.
@@ -177,7 +179,7 @@ class CollisionChecker:
 
         Args:
             pose: (6,) box pose [m, rad].
-            pair: index of the pair of payload and body.
+            pair: index of the active pair of payload and body.
         """
         placed = self._place(pose[None], *self._still())
         zero = np.zeros(1, dtype=np.intp)
@@ -186,13 +188,15 @@ class CollisionChecker:
     def motion(
         self, start: tuple[Array, Array, Array], end: tuple[Array, Array, Array]
     ) -> tuple[Array, Array]:
-        """Compute chord and bend (n, n_pairs) [m] of every pair between two configurations.
-
-        The chord bounds the relative motion of a pair between both ends; the bend bounds its second
-        derivative and thereby the distance from straight motion (`symbolic.geometry.clearance`).
+        """Compute bounds of the relative motion of every pair between two configurations.
 
         Args:
-            start, end: box pose (n, 6), q_1 and q_2 (n, joints).
+            start, end: each a box pose (n, 6) and joint positions q_1 and q_2 (n, joints).
+
+        Returns:
+            Chord and bend (n, n_pairs) [m]. The chord bounds the distance that the bodies of a pair
+            move relative to each other from start to end, the bend the second derivative of this
+            motion (`symbolic.geometry.clearance`).
         """
         asked = [self.functions[f"{block}motion"] for block in self.geometry.asked]
         found = [function.batch(*start, *end) for function in asked]
@@ -204,10 +208,10 @@ class CollisionChecker:
     def measure(
         self, pose: Array, q_1: Array, q_2: Array, clearance: Array, wanted: NDArray[np.bool_]
     ) -> NDArray[np.intp]:
-        """Raise lower bounds of wanted pairs, in place, to proven distances [m].
+        """Replace lower bounds of chosen pairs by measured distances, in place.
 
-        A bound that is higher already stays. If the payload may rest on a body, its shape shrunk by
-        the resting tolerance is measured, and the pair's tolerance is added to the distance.
+        A bound that exceeds the measured distance stays. If the payload may rest on a body, the
+        payload shrunk by the resting tolerance is measured, and the pair's tolerance is added.
 
         Args:
             pose: (n, 6) box poses [m, rad].
@@ -216,7 +220,7 @@ class CollisionChecker:
             wanted: (n, n_pairs) True for the pairs to be measured.
 
         Returns:
-            (n,) index of the first wanted pair of each sample that collides, or -1. The bound of a
+            (n,) index of the first chosen pair that collides at each sample, or -1. The bound of a
             colliding pair stays.
         """
         hits = np.full(len(pose), -1)
@@ -241,15 +245,15 @@ class CollisionChecker:
     def violates_clearance(
         self, configuration: Array, wanted: NDArray[np.bool_], required: Array
     ) -> NDArray[np.bool_]:
-        """Find pairs that are closer than required, as an upper bound of their distance proves.
+        """Find pairs that are provably closer than required.
 
         Args:
-            configuration: (n, 6 + all joints).
-            wanted: (n, n_pairs) True for the pairs in question.
-            required: (n, n_pairs) distances [m].
+            configuration: (n, 6 + all joints) box poses and joints of both arms.
+            wanted: (n, n_pairs) True for the pairs to be tested.
+            required: (n, n_pairs) required distances [m].
 
         Returns:
-            (n, n_pairs) True for pairs that are closer. False for a payload where it may rest on
+            (n, n_pairs) True for tested pairs that are closer. False where the payload may rest on
             the body.
         """
         found = np.zeros(wanted.shape, dtype=bool)
@@ -292,8 +296,10 @@ class CollisionChecker:
     def _bodies(
         self, pairs: NDArray[np.intp], resting: NDArray[np.bool_]
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the indices of both bodies of each pair (m,); the shrunk payload where `resting`
-        is True."""
+        """Return the indices (m,) of the first and of the second body of each pair.
+
+        Where `resting` is True, the shrunk payload replaces the payload.
+        """
         first, second = self._pairs[pairs].T
         return np.where(resting, self.distances.shrunk_payload, first), second
 
@@ -309,7 +315,14 @@ class CollisionChecker:
         pairs: NDArray[np.intp],
         resting: NDArray[np.bool_],
     ) -> NDArray[np.bool_]:
-        """Decide which pairs (m,) collide, by proof, and by FCL where no proof succeeds."""
+        """Decide which pairs collide, (m,), by proof, and by FCL where no proof succeeds.
+
+        Args:
+            placed: outputs of the function `piece_poses`.
+            rows: (m,) index of the sample of each query.
+            pairs: (m,) index of the active pair of each query.
+            resting: (m,) True where the payload may rest on the body.
+        """
         first, second = self._bodies(pairs, resting)
         # A resting payload may come nearer than the tolerance; it only must not intersect.
         tolerance = np.where(resting, 0.0, self.geometry.tolerance[pairs])
@@ -329,7 +342,9 @@ class CollisionChecker:
     def _resting(
         self, pose: Array, rows: NDArray[np.intp], pairs: NDArray[np.intp]
     ) -> NDArray[np.bool_]:
-        """Return True for each query (m,) in which the box may rest on the body at its pose."""
+        """Return True for each query (m,) in which the box may rest on the other body of
+        the pair.
+        """
         found = np.zeros(len(pairs), dtype=bool)
         for pair, place, departure in self.resting_places:
             near = np.linalg.norm(pose[:, :3] - place, axis=1) <= departure

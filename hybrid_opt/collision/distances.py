@@ -1,13 +1,13 @@
-"""The bodies of a cell as objects of Coal, whose distances are proven by their shapes
-(`distances.cpp`), and of FCL, for collision verdicts.
+"""Proven distances between the bodies of a cell (with Coal), and collision verdicts of FCL.
 
-A lower bound is the gap between both bodies along a direction that Coal's GJK proposes. It never
-exceeds their distance, whether the solver converges or not; if it does, it is within 1e-8 m of it.
-An upper bound below zero is the radius of a ball inside the Minkowski difference, so the depth of
-an intersection is at least as large.
+A lower bound of a distance is the gap between both bodies along a direction that Coal's GJK
+algorithm proposes. The bound never exceeds the distance, even if the algorithm does not converge;
+if it converges, the bound is within 1e-8 m of the distance. An upper bound below zero is minus the
+radius of a ball inside the Minkowski difference, so the bodies intersect at least that deep.
 
-FCL decides pairs that are closer to contact than its resolution (`hybrid_opt.collision.checker`).
-Its distances may exceed the true ones by tenths of a millimetre.
+FCL decides pairs that are closer to contact than FCL's resolution
+(`hybrid_opt.collision.checker`). The distances of FCL may exceed the true ones by tenths of a
+millimetre.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ FCL_RESOLUTION = 1e-5
 
 @cache
 def compiled_distances() -> Any:
-    """Load the compiled module.
+    """Load the C++ extension module of distances.
 
     Raises:
         BridgeError: the module is missing, cannot be loaded, or was compiled against another Coal.
@@ -51,15 +51,15 @@ def compiled_distances() -> Any:
 class BodyDistances:
     """Distance queries of many pairs of bodies at many poses in one call.
 
-    A query of a pair starts from the direction of the pair's query before, so order queries by
-    samples. Threads may share one.
+    A query starts from the direction that the previous query of the same pair found, so queries in
+    the order of the samples are fastest. Threads may share one object.
 
     Attributes:
         bodies: bodies of the geometry, then the payload shrunk by the resting tolerance.
         first_piece: (n_bodies + 1,) index of the first piece of each body among all pieces.
-        poses: (n_pieces,) index of each piece's pose in the cell's `piece_poses`.
-        shrunk_payload: index of the shrunk payload.
-        native: the compiled object; C code passes its `address` to `decide_pair`.
+        poses: (n_pieces,) index of each piece's pose in the output of the function `piece_poses`.
+        shrunk_payload: index of the shrunk payload in `bodies`.
+        native: the object of the C++ module; C code passes its `address` to `decide_pair`.
     """
 
     def __init__(self, geometry: CellGeometry, resting_tolerance: float) -> None:
@@ -95,11 +95,11 @@ class BodyDistances:
         Args:
             placed: outputs of the function `piece_poses` for n samples.
             rows: (m,) index of the sample of each query.
-            first, second: (m,) indices of both bodies.
+            first, second: (m,) indices of the two bodies of each query in `bodies`.
 
         Returns:
-            Lower and upper bounds (m,) [m]. Both are negative if the bodies intersect, and -inf and
-            inf at a pose that is not finite.
+            Lower and upper bounds (m,) [m]. Both are negative if the bodies intersect. They are
+            -inf and inf at a pose that is not finite.
         """
         at = placed["quaternions"], placed["positions"]
         lower, upper = self.native.distances(*at, rows, first, second)
@@ -114,13 +114,13 @@ class BodyDistances:
         apart: Array,
         overlap: Array,
     ) -> NDArray[np.int8]:
-        """Try to prove of m pairs that they are apart or that they intersect.
+        """Try to prove for m pairs of bodies that they are apart, or that they intersect.
 
         Args:
             placed, rows, first, second: as in `bounds`.
-            apart: (m,) the proof of `APART` shows a distance above this [m].
-            overlap: (m,) the proof of `INTERSECTING` shows a depth above this [m]. A negative value
-                stands for a distance that the pair falls short of.
+            apart: (m,) `APART` proves a distance above this value [m].
+            overlap: (m,) `INTERSECTING` proves a depth of intersection above this value [m]. If the
+                value is negative, it proves a distance below minus the value.
 
         Returns:
             (m,) `APART`, `INTERSECTING`, or `OPEN` if neither is proven.
@@ -133,10 +133,10 @@ class BodyDistances:
 def shape_table(
     shapes: Sequence[ConvexShape],
 ) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], Array]:
-    """Return kinds (n,), sizes (n, 3) [m], numbers of corners (n,), and the corners (m, 3) [m] of
-    hulls.
+    """Return shapes as the four arrays that the C++ class `Bodies` takes first.
 
-    The compiled `Bodies` takes these four arrays first; `distances.cpp` defines the sizes.
+    These are kinds (n,), sizes (n, 3) [m], numbers of corners (n,), and the corners (m, 3) of all
+    hulls [m]; `distances.cpp` defines kinds and sizes.
     """
     kinds, sizes = zip(*(_measures(shape) for shape in shapes), strict=True)
     corners = [s.vertices if isinstance(s, Hull) else np.zeros((0, 3)) for s in shapes]
@@ -171,7 +171,11 @@ class Judge:
     """
 
     def __init__(self, distances: BodyDistances) -> None:
-        """Create FCL objects of the same bodies."""
+        """Create FCL objects of all bodies.
+
+        Args:
+            distances: distance queries, which hold the bodies.
+        """
         self.calls = 0
         self._request = fcl.CollisionRequest()
         self._objects = [[fcl_object(p) for p in body.pieces] for body in distances.bodies]

@@ -1,9 +1,9 @@
-"""Tabulated distances of two links of an arm with two turning joints between them.
+"""Tabulated lower bounds of the distance of two links with two turning joints between them.
 
-The distance depends on the positions of these two joints alone. A table covers one turn of both
-joints by a grid of cells. In each cell it holds a lower bound: the distance at the cell's centre,
-minus the largest distance by which the later link can move within the cell. Pieces far from the
-joint axes move farther, so each piece has its own reach.
+The distance depends on the positions of these two joints alone. A table divides one turn of both
+joints into a grid of cells. Its entry is a lower bound for the whole cell: the distance at the
+cell's centre minus the largest distance by which the later link can move within the cell. Pieces
+far from the joint axes move farther, so the motion is bounded piece by piece.
 """
 
 from __future__ import annotations
@@ -56,9 +56,9 @@ class JointTable:
     Attributes:
         pair: index of the pair among the active pairs.
         robot: index of the arm.
-        joint: index of the first of the two joints.
-        bounds: (CELLS, CELLS) bounds by cells of the first and of the second joint [m]; -1 in cells
-            that the joint limits exclude.
+        joint: index of the first of the two joints between the bodies; the second follows it.
+        bounds: (CELLS, CELLS) lower bounds by cells of the first and of the second joint [m]; -1 in
+            cells that the joint limits exclude.
     """
 
     pair: int
@@ -67,8 +67,13 @@ class JointTable:
     bounds: NDArray[np.float32]
 
     def look_up(self, q: Array) -> Array:
-        """Return lower bounds (n,) [m] at joint positions (n, joints) of the arm; -inf if a
-        position is not finite or beyond `MOST_ANGLE`."""
+        """Return lower bounds (n,) of the pair's distance at joint positions of the arm [m].
+
+        A bound is -inf if a position is not finite or beyond `MOST_ANGLE`.
+
+        Args:
+            q: (n, joints) joint positions [rad].
+        """
         positions = q[:, self.joint : self.joint + 2]
         known = np.all(np.abs(positions) < MOST_ANGLE, axis=1)
         cells = np.floor(np.where(known[:, None], positions, 0.0) * CELLS_PER_RADIAN)
@@ -77,10 +82,10 @@ class JointTable:
 
 
 def joint_tables(geometry: CellGeometry) -> tuple[JointTable, ...]:
-    """Build tables for the pairs that compiled bounds often leave open.
+    """Build tables for pairs that compiled bounds often cannot decide.
 
-    These are pairs of bodies with hulls and with two turning joints of one arm between them, if
-    they are close in many postures or if the earlier body carries the arm.
+    Both joints between the bodies of such a pair turn and belong to one arm. A body has a hull. The
+    bodies are close in many postures, or the arm is mounted on the earlier body.
     """
     close, found = close_pairs(geometry), []
     for k, pair in enumerate(geometry.active):
@@ -100,11 +105,10 @@ def joint_tables(geometry: CellGeometry) -> tuple[JointTable, ...]:
 
 
 def _in_root(body: CollisionBody, arm: ArmGeometry) -> tuple[Piece, ...]:
-    """Return the pieces of a body as seen by an arm.
+    """Return the pieces of a body in a frame that does not depend on the place of the arm.
 
-    Pieces of a link stay in the link's frame. Pieces of a body fixed to the world are moved into
-    the frame of the arm's root. Their poses are rounded there, so that a table does not depend on
-    the place of the arm in the cell.
+    This is the link's frame for a moving link, and the frame of the arm's root for a fixed body.
+    The poses of a fixed body's pieces are rounded.
     """
     if body.frame != WORLD:
         return body.pieces

@@ -1,9 +1,9 @@
 """Evaluation of candidates: compiled physics, collision verdict, objectives, feasibility.
 
 Every search calls this evaluation. A candidate is a decision vector, evaluated on the task's
-samples. Infeasible candidates get the paper's penalty (Eq. 60), extended to every constraint: all
-objectives take the value 1 + (time in violation, summed over the constraints) / duration. The
-evaluation also returns each constraint's violation for constraint domination.
+samples. All objectives of an infeasible candidate take the paper's penalty (Eq. 60), extended to
+every constraint: 1 + (time in violation, summed over the constraints) / duration. The evaluation
+also returns the violation of each constraint, for searches by constraint domination.
 """
 
 from __future__ import annotations
@@ -79,10 +79,10 @@ class Evaluations:
         reason: (n,) index into `REASONS` of the constraint violated first along the path, or
             `FEASIBLE`.
         position: (n,) path parameter in [0, 1] of the first violation; NaN if feasible.
-        violation: (n, len(REASONS)) violation of each constraint, 0 if satisfied. It has the unit
-            of the constraint (`symbolic.functions.CONSTRAINTS`); for collisions it is the share of
-            time, and it is 1 for the reasons after collision.
-        violation_time: (n, len(REASONS)) time in violation over the duration.
+        violation: (n, len(REASONS)) violation of each constraint, 0 if satisfied, in the unit of
+            the constraint (`symbolic.functions.CONSTRAINTS`). For `collision` it is the share of
+            the duration in collision, for `between_samples` and `not_finite` 0 or 1.
+        violation_time: (n, len(REASONS)) time in violation of each constraint over the duration.
     """
 
     x: Array
@@ -98,7 +98,12 @@ class Evaluations:
         return len(self.x)
 
     def judgement(self, row: int, objective_names: Sequence[str]) -> Judgement:
-        """Return the verdict on one candidate in words."""
+        """Return the verdict on one candidate in words.
+
+        Args:
+            row: index of the candidate.
+            objective_names: names of the objectives, in the order of the columns of `objectives`.
+        """
         feasible = bool(self.feasible[row])
         return Judgement(
             feasible=feasible,
@@ -109,8 +114,10 @@ class Evaluations:
 
     @property
     def infeasible_by_reason(self) -> dict[str, int]:
-        """Number of infeasible candidates by the constraint that each violates first, largest
-        number first."""
+        """Number of infeasible candidates by the constraint that each candidate violates first.
+
+        The largest number comes first.
+        """
         counts = {name: int(np.sum(self.reason == i)) for i, name in enumerate(REASONS)}
         found = sorted(counts.items(), key=lambda item: -item[1])
         return {name: count for name, count in found if count}
@@ -127,7 +134,7 @@ class Evaluations:
 
 
 def concatenated(parts: list[Evaluations]) -> Evaluations:
-    """Concatenate evaluations in order. At least one is needed."""
+    """Concatenate at least one record of evaluations, in order."""
     return Evaluations(
         **{f.name: np.concatenate([getattr(p, f.name) for p in parts]) for f in fields(Evaluations)}
     )
@@ -199,7 +206,9 @@ class CandidateEvaluator:
 
     @cached_property
     def _kernel(self) -> Kernel | None:
-        """The evaluation in lanes; None if the machine or the cell does not support it."""
+        """The evaluation of several candidates side by side; None if the machine or the cell does
+        not support it.
+        """
         return load_kernel(self.compiled, self.checker, self.outputs) if self._in_lanes else None
 
     def _driver(self, threads: int) -> CandidateDriver | None:
@@ -234,17 +243,26 @@ class CandidateEvaluator:
         return other
 
     def outputs(self, x: Array) -> dict[str, Array]:
-        """Compute every per-sample output of `symbolic.functions.candidate_function` for decision
-        vectors x (n, n_var). In drivable cells the result has the additional outputs of
-        `hybrid_opt.timing.path_timer.CandidateDriver.outputs`."""
+        """Compute every per-sample output of `symbolic.functions.candidate_function`.
+
+        In drivable cells the result also has the outputs of
+        `hybrid_opt.timing.path_timer.CandidateDriver.outputs`.
+
+        Args:
+            x: (n, n_var) decision vectors.
+
+        Returns:
+            Arrays (n, samples, ...) by name.
+        """
         return self._outputs(self._checked(x))
 
     def evaluate(self, x: Array, with_collisions: bool = True) -> Evaluations:
         """Evaluate decision vectors.
 
         Args:
-            x: (n, n_var).
-            with_collisions: False skips the collision check if the evaluation is in lanes.
+            x: (n, n_var) decision vectors.
+            with_collisions: False to skip the collision check, if candidates are evaluated in
+                lanes.
 
         Raises:
             SettingsError: x has the wrong shape.
@@ -259,7 +277,7 @@ class CandidateEvaluator:
         return self._judge(x, sampled, sampled.outputs if self._needs else self._outputs(x))
 
     def carry(self, x: Array) -> Carry:
-        """Evaluate one decision vector (n_var,) under the task's time law.
+        """Return the carry of one decision vector x (n_var,) under the task's time law.
 
         Raises:
             SettingsError: x has the wrong shape.
@@ -272,8 +290,8 @@ class CandidateEvaluator:
         return carry_from_outputs(self.workcell, self.functions, x[0], single, judgement)
 
     def certificate(self, x: Array) -> Certificate:
-        """Certify that the carry of one decision vector x (n_var,) is free of collisions
-        throughout.
+        """Certify that the carry of one decision vector x (n_var,) is free of collisions along the
+        whole path.
 
         Raises:
             LostPathError: an arm loses the path, on its samples or between them.
@@ -290,8 +308,9 @@ class CandidateEvaluator:
         return found
 
     def _paths(self, x: Array) -> list[SampledPath | None]:
-        """Return the sampled paths of decision vectors x (n, n_var); None for a path that an arm
-        loses."""
+        """Return the sampled path of each decision vector x (n, n_var); None if an arm loses the
+        path.
+        """
         if self._kernel is None:
             outputs: Mapping[str, Array] = self.outputs(x)
         else:
@@ -307,12 +326,12 @@ class CandidateEvaluator:
         ]
 
     def certified(self, evaluations: Evaluations) -> Evaluations:
-        """Return the evaluations with a feasible front that is proven free of collisions
-        throughout.
+        """Return the evaluations, corrected such that the feasible front is proven free of
+        collisions.
 
-        A member of the front without proof becomes infeasible for the reason `between_samples`.
-        Candidates that only such members dominated enter the front and are certified too, until
-        every member has a proof.
+        The members of the front are certified along their whole paths. A member without proof
+        becomes infeasible for the reason `between_samples`. Candidates that then enter the front
+        are certified likewise, until every member has a proof.
         """
         feasible, reason = evaluations.feasible.copy(), evaluations.reason.copy()
         position, violation = evaluations.position.copy(), evaluations.violation.copy()
@@ -338,9 +357,13 @@ class CandidateEvaluator:
         )
 
     def _failures_between_samples(self, x: Array) -> list[float | None]:
-        """Return for each carry x (n, n_var) the path parameter at which the proof fails, else
-        None. Results are cached by path, since several carries may differ only in their force
-        limit."""
+        """Return the path parameter at which each carry's proof fails; None for a carry with proof.
+
+        Results are cached by path, since several carries may differ only in their force limit.
+
+        Args:
+            x: (n, n_var) decision vectors.
+        """
         paths = np.ascontiguousarray(x[:, : self.workcell.task.n_path])
         keys = [path.tobytes() for path in paths]
         new = {key: row for row, key in enumerate(keys) if key not in self._proofs}
@@ -365,12 +388,12 @@ class CandidateEvaluator:
     def _judge(
         self, x: Array, sampled: SampledVerdicts, described: Mapping[str, Array]
     ) -> Evaluations:
-        """Compute objectives, feasibility and penalties.
+        """Compute objectives, feasibility and penalties from the results on the samples.
 
         Args:
             x: (n, n_var) decision vectors.
             sampled: violations and collisions on the samples.
-            described: per-sample outputs that the objectives need.
+            described: per-sample outputs that the objectives need, by name.
         """
         values = np.column_stack(
             [objective.evaluate(described, self.workcell) for objective in self.objectives]
@@ -424,16 +447,23 @@ class CandidateEvaluator:
 
 
 def _failure(certificate: Certificate | None) -> float | None:
-    """Return the path parameter at which a certificate fails: 0 if an arm loses the path. None if
-    the carry is proven free."""
+    """Return the path parameter at which a certificate fails; None for a path that is proven free.
+
+    The result is 0 if an arm loses the path.
+
+    Args:
+        certificate: the certificate; None if an arm loses the path on a sample.
+    """
     if certificate is not None and certificate.is_free:
         return None
     return 0.0 if certificate is None or certificate.lost else certificate.at_parameter
 
 
 def _needs(objectives: Sequence[Objective]) -> tuple[str, ...] | None:
-    """Return the names of the kernel's per-sample outputs that the objectives need; None if an
-    objective needs an output that the kernel lacks."""
+    """Return the names of the per-sample outputs that the objectives need from the kernel.
+
+    The result is None if an objective needs an output that the kernel lacks.
+    """
     wanted: set[str] = set()
     for objective in objectives:
         if objective.needs is None:
@@ -443,10 +473,10 @@ def _needs(objectives: Sequence[Objective]) -> tuple[str, ...] | None:
 
 
 class LockedEvaluator:
-    """Evaluator for box paths with every redundant joint locked at one position.
+    """Evaluator for box paths along which every redundant joint stays at one position.
 
-    A redundant joint on a constant path moves like an arm with this joint locked, so one compiled
-    cell serves all positions. Decision vectors are the free waypoints of the box.
+    A joint with a constant path moves the arm like a locked joint, so one compiled cell serves all
+    positions. Decision vectors are the free waypoints of the box.
     """
 
     def __init__(self, evaluator: CandidateEvaluator, positions: Array) -> None:
@@ -473,7 +503,7 @@ class LockedEvaluator:
         self.lower, self.upper = evaluator.lower[: self.n_var], evaluator.upper[: self.n_var]
 
     def evaluate(self, x: Array) -> Evaluations:
-        """Evaluate box paths x (n, n_var)."""
+        """Evaluate box paths x (n, n_var), the free waypoints of the box."""
         return replace(self._evaluator.evaluate(self._whole(x)), x=x)
 
     def certified(self, evaluations: Evaluations) -> Evaluations:

@@ -28,18 +28,18 @@ DAMPING = 1e-4
 
 @dataclass(frozen=True)
 class Explanation:
-    """The first failure of one candidate.
+    """The first failure of one infeasible candidate.
 
     Attributes:
         reason: one of `hybrid_opt.evaluate.evaluation.REASONS`.
-        position: path parameter of the sample.
-        sample: index of the sample, from 0.
+        position: path parameter of the failure, 0 to 1.
+        sample: index of the nearest sample, from 0.
         pair: names of the two bodies that collide; None for another reason.
-        joint: 'robot/joint' beyond its limit; None for another reason.
+        joint: name 'robot/joint' of the joint that is beyond its limit; None for another reason.
         excess: distance of this joint beyond its limit [rad, or m for a sliding joint].
         unit: unit of the excess.
         robot: name of the arm that does not reach its contact; None for another reason.
-        missing: least distance of this arm's flange from the place that it has to reach [m].
+        missing: distance of this arm's flange from the place that it has to reach [m].
     """
 
     reason: str
@@ -64,11 +64,14 @@ class Explanation:
 
 
 def explain(evaluator: CandidateEvaluator, evaluations: Evaluations) -> tuple[Explanation, ...]:
-    """Explain why each infeasible candidate fails, in the order of the candidates.
+    """Explain why each infeasible candidate fails.
 
     Args:
         evaluator: the evaluator of the candidates.
         evaluations: evaluations by this evaluator.
+
+    Returns:
+        One explanation per infeasible candidate, in the order of the candidates.
     """
     rows = np.flatnonzero(~evaluations.feasible)
     found = []
@@ -80,8 +83,11 @@ def explain(evaluator: CandidateEvaluator, evaluations: Evaluations) -> tuple[Ex
 
 
 def frequent(explanations: Iterable[Explanation]) -> dict[str, dict[str, int]]:
-    """Count failures by colliding pair ('pairs'), joint ('joints') and arm out of reach ('reach'),
-    the most frequent first."""
+    """Count failures by colliding pair, joint beyond its limit, and arm out of reach.
+
+    Returns:
+        Under 'pairs', 'joints' and 'reach' the number of failures by name, the largest first.
+    """
     counts: dict[str, Counter[str]] = {"pairs": Counter(), "joints": Counter(), "reach": Counter()}
     for one in explanations:
         if one.pair is not None:
@@ -128,8 +134,9 @@ def _explained(
 def missing_reach(robot: Robot, contact: Contact, T_world_box: Array, q: Array) -> float:
     """Compute how far the flange of an arm stays from the place at which it would hold the box [m].
 
-    Damped least squares bring position and orientation together as near as the joint limits allow,
-    from one posture. From another posture the flange may come nearer.
+    Damped least squares reduce the errors of position and orientation together, within the joint
+    limits. The result is the position error of the best posture found. From another initial posture
+    the flange may come nearer.
 
     Args:
         robot, contact: the arm and its contact.

@@ -1,11 +1,12 @@
-"""Evaluation of candidates on their samples: constraints and collisions, before objectives.
+"""Constraint violations and collisions of candidates on their samples.
 
-Whole evaluations run in lanes: `kernel.c` calls the cell's functions sample by sample, several
-candidates side by side, sums up the violations, bounds every pair's distance, and has Coal prove of
-pairs that the bounds leave open that they are apart or intersect; the rest is left to FCL.
-Quantities per sample leave it only on request. `evaluate_numpy` computes the same in NumPy, from
-the outputs of the candidate function: the kernel's oracle, and the evaluation of candidates of
-drivable cells.
+The compiled `kernel.c` evaluates several candidates side by side (in lanes). It calls the cell's
+functions sample by sample, sums up the violations, and computes a lower bound of every pair's
+distance. For pairs that the bound leaves open Coal tries a proof; FCL decides the rest. Quantities
+per sample are returned only on request.
+
+`evaluate_numpy` computes the same in NumPy from the outputs of the candidate function. It is the
+reference of the kernel, and evaluates the candidates of drivable cells.
 """
 
 from __future__ import annotations
@@ -55,9 +56,10 @@ class SampledVerdicts:
     Attributes:
         outputs: 'time' (n, samples) [s], 'violation' and 'violation_time' (n, constraints), and
             further outputs of `symbolic.functions.candidate_function` on request.
-        first_sample: (n,) first sample that violates a constraint; the number of samples if none
-            does.
-        first_reason: (n,) first constraint violated at this sample; -1 if none is.
+        first_sample: (n,) index of the first sample that violates a constraint; the number of
+            samples if there is none.
+        first_reason: (n,) index of the first constraint violated at this sample; -1 if there is
+            none.
         colliding: (n, samples) True for samples in collision. Samples after an arm has lost the
             path are False.
     """
@@ -69,8 +71,12 @@ class SampledVerdicts:
 
 
 def evaluate_numpy(outputs: Mapping[str, Array], checker: CollisionChecker) -> SampledVerdicts:
-    """Compute violations and collisions in NumPy, from every per-sample output of the candidate
-    function."""
+    """Compute violations and collisions of n candidates in NumPy.
+
+    Args:
+        outputs: all per-sample outputs of the candidate function, (n, samples, ...) by name.
+        checker: collision checker of the workcell.
+    """
     violated = np.asarray(outputs["constraint"] > 0.0)
     bad = np.asarray(np.any(violated, axis=2))
     n, samples = bad.shape
@@ -87,7 +93,7 @@ def evaluate_numpy(outputs: Mapping[str, Array], checker: CollisionChecker) -> S
 
 
 def reached_samples(outputs: Mapping[str, Array], row: int) -> tuple[Array, Array, Array]:
-    """Return the motion of a candidate up to the sample at which the first arm loses the path.
+    """Return the motion of a candidate before the first sample at which an arm loses the path.
 
     Only these k samples are checked for collisions.
 
@@ -106,13 +112,13 @@ def reached_samples(outputs: Mapping[str, Array], row: int) -> tuple[Array, Arra
 
 
 def collision_shares(colliding: NDArray[np.bool_], time: Array) -> Array:
-    """Compute the share (n,) of the duration that is spent in collision.
+    """Compute the share (n,) of the duration that n candidates spend in collision.
 
-    A colliding sample counts for half of both neighbouring steps.
+    A colliding sample counts with half of each neighbouring time step.
 
     Args:
         colliding: (n, samples) True for samples in collision.
-        time: (n, samples) [s].
+        time: (n, samples) times of the samples [s].
     """
     shares, halves = np.zeros(len(time)), np.diff(time) / 2.0
     durations = np.zeros(time.shape)
@@ -124,8 +130,9 @@ def collision_shares(colliding: NDArray[np.bool_], time: Array) -> Array:
 
 
 class Kernel:
-    """Evaluation of a cell's candidates in lanes. Threads must not share one, because it owns a
-    checker.
+    """Compiled evaluation of several candidates side by side, in lanes.
+
+    Threads must not share one, because it owns a checker.
 
     Attributes:
         lanes: number of candidates evaluated side by side.
@@ -138,10 +145,10 @@ class Kernel:
 
         Args:
             library: compiled kernel, from `load_kernel`.
-            checker: collision checker that decides open pairs.
+            checker: collision checker, which decides the pairs that the kernel leaves open.
             numbers: (n,) parameters of the cell, group after group.
-            start: joints of the first arm, then of the second, that hold the box at the start
-                [rad].
+            start: (joints of both arms,) joint positions of the first arm, then of the second, that
+                hold the box at the start [rad].
         """
         self._evaluate = library.dual_arm_evaluate
         self._evaluate.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_longlong]
@@ -167,15 +174,15 @@ class Kernel:
         """Evaluate decision vectors on their samples.
 
         Args:
-            x: (n, n_var).
-            wanted: names of `sample_sizes` to be returned per sample.
-            with_collisions: False skips the collision check.
-            threads: number of threads; 0 for one per core. The results do not depend on it. FCL's
-                part runs in the calling thread.
-            begin: joints of the first arm, then of the second, that hold the box at the start
-                [rad]; None for the cell's start branches.
-            all_forces: False leaves contact forces at zero if another constraint is already
-                violated, in cells whose forces are the solution of a program.
+            x: (n, n_var) decision vectors.
+            wanted: names in `sample_sizes` of the outputs to be returned per sample.
+            with_collisions: False to skip the collision check.
+            threads: number of threads; 0 for one per core. The results do not depend on it. FCL
+                runs in the calling thread.
+            begin: (joints of both arms,) joint positions that hold the box at the start [rad]; None
+                for the cell's start branches.
+            all_forces: in cells whose contact forces are the solution of an optimisation, False
+                leaves the forces of a candidate at zero if it violates another constraint.
 
         Raises:
             CodegenError: memory is short.
@@ -236,8 +243,16 @@ class Kernel:
         begin: Array | None,
         **choices: bool,
     ) -> list[NDArray[np.void]]:
-        """Run the kernel on the candidates of one thread; return the pairs that it leaves to
-        FCL."""
+        """Run the kernel on the candidates of one thread; return the pairs that FCL has to decide.
+
+        Args:
+            arrays: inputs and outputs of the kernel by name, one row per candidate.
+            wanted: addresses of the arrays of per-sample outputs; None for outputs that are not
+                wanted.
+            begin: (joints of both arms,) joints at the start [rad]; None for the cell's start
+                branches.
+            choices: `with_collisions` and `all_forces` as in `evaluate`.
+        """
         n = len(arrays["x"])
         room = np.empty(self._room if choices["with_collisions"] else 0, self._open_pair)
         pointers = (ctypes.c_void_p * len(wanted))(*wanted)
@@ -265,7 +280,8 @@ class Kernel:
         """Decide by the collision checker which of n pairs collide.
 
         Args:
-            left: (n,) records `open_pair` that the compiled bounds could not decide, at least one.
+            left: (n,) records `open_pair` of the pairs that the kernel could not decide, n at least
+                1.
 
         Returns:
             (n,) True for pairs in collision.
@@ -325,7 +341,7 @@ def load_kernel(
 
 
 def _same(found: SampledVerdicts, expected: SampledVerdicts) -> bool:
-    """Return True if two evaluations agree to the last bit in every output of the first one."""
+    """Return True if two evaluations agree to the last bit, in every output that `found` has."""
     pairs = [(values, expected.outputs[name]) for name, values in found.outputs.items()]
     pairs += [
         (getattr(found, name), getattr(expected, name))
@@ -387,8 +403,10 @@ def _definitions(geometry: CellGeometry) -> str:
 
 
 def _groups(compiled: CompiledCell) -> list[str]:
-    """Return the names of the parameter groups that the kernel takes, in order. The squeezes of
-    commanded forces are not among them."""
+    """Return the names of the parameter groups that the kernel takes, in order.
+
+    These are all groups but the squeezes of commanded forces.
+    """
     from symbolic.parameters import SQUEEZES
 
     return [name for name in compiled.numbers.sizes if name not in SQUEEZES]

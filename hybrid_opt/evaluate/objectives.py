@@ -1,8 +1,8 @@
 """Objectives of a search, each a pure function of the evaluator's outputs.
 
-The paper's two are the peak normal forces of both robots (Eq. 60). All are dimensionless and
-scaled so that values of interest lie below one, which keeps the paper's penalty (values above
-one for every infeasible candidate) meaningful for any selection of them.
+The paper's two objectives are the peak normal forces of both robots (Eq. 60). All objectives are
+dimensionless, and scaled such that values of interest are below one. The paper's penalty gives
+every infeasible candidate values above one, so it works with any selection of objectives.
 """
 
 from __future__ import annotations
@@ -33,7 +33,8 @@ class Objective:
     Attributes:
         name: name on the command line and in results.
         title: name on axes and in tables.
-        evaluate: function that computes the values (n,).
+        evaluate: function from the evaluator's outputs and the workcell to values (n,) of n
+            candidates.
         needs: names of the outputs that `evaluate` uses; None if unknown, which makes evaluation
             slower.
     """
@@ -103,28 +104,30 @@ def _larger(forces: Evaluate) -> Evaluate:
 
 
 def _peak_forces(outputs: Outputs, workcell: Workcell) -> Array:
-    """Return the peak normal forces (n, 2) over the reference forces: of the whole path if the
-    timing knows them, else of the samples."""
+    """Return the peak normal forces (n, 2) of both robots over their reference forces.
+
+    The peaks are those of the whole path if the timing computes them, else those of the samples.
+    """
     known = outputs.get("peak_force")
     peaks = outputs["normal_force"].max(axis=1) if known is None else known
     return np.asarray(peaks / workcell.task.reference_force)
 
 
 def _mean_force(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the time mean of both normal forces over the mean reference force."""
+    """Compute the time mean of both normal forces over the mean reference force, (n,)."""
     both, time = outputs["normal_force"].mean(axis=2), outputs["time"]
     mean = np.trapezoid(both, time, axis=1) / (time[:, -1] - time[:, 0])
     return np.asarray(mean / float(workcell.task.reference_force.mean()), dtype=float)
 
 
 def _duration(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the duration over `duration_unit`."""
+    """Compute the durations (n,) over `duration_unit`."""
     duration = outputs["time"][:, -1] / duration_unit(workcell)
     return np.asarray(duration, dtype=float)
 
 
 def _peak_torque_use(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the largest joint torque from the contact wrench over that joint's maximum."""
+    """Compute the largest joint torque from the contact wrench over that joint's maximum, (n,)."""
     uses = [
         (np.abs(outputs[f"joint_torque_{i + 1}"]) / robot.torque_max).max(axis=(1, 2))
         for i, robot in enumerate(workcell.robots)
@@ -133,15 +136,18 @@ def _peak_torque_use(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _force_imbalance(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the largest difference of the two normal forces over the mean reference force."""
+    """Compute the largest difference of both normal forces over the mean reference force, (n,)."""
     forces = outputs["normal_force"]
     difference: Array = np.abs(forces[:, :, 0] - forces[:, :, 1]).max(axis=1)
     return difference / float(workcell.task.reference_force.mean())
 
 
 def _joint_length(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the length of the path of both arms in joint space over the length of the joint
-    ranges (Euclidean)."""
+    """Compute the length of both arms' path in joint space over the length of the joint ranges,
+    (n,).
+
+    Both lengths are Euclidean.
+    """
     steps = [np.diff(outputs[name], axis=1) for name in _JOINTS]
     length = np.sqrt(sum((step**2).sum(axis=2) for step in steps)).sum(axis=1)
     ranges = workcell.stack_joint_limits("position_upper") - workcell.stack_joint_limits(
@@ -151,13 +157,14 @@ def _joint_length(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the largest share of the friction that is used if both pads press with the reference
-    force.
+    """Compute the largest used share of the friction if both pads press with the reference force,
+    (n,).
 
-    With the least normal forces friction is fully used by construction. So the forces are raised to
-    the reference forces. The needed coefficient is then F_t / (N_1 + N_2) with N_1 - N_2 = F_n; the
-    result is its share of the smaller friction coefficient. Of hands that hold by themselves it is
-    the share of the friction of their whole holding force.
+    The least normal forces use the friction fully, by construction. So the forces N_1 and N_2
+    are raised to the reference force, with their difference kept. The needed friction coefficient
+    is the sum of both tangential forces over N_1 + N_2; the result is its ratio to the smaller
+    coefficient. For hands that hold without a squeeze it is the tangential force of a hand over the
+    friction of its holding force.
     """
     if not contact_model(workcell).is_squeeze:
         bearing = workcell.task.reference_force * [pad.friction for pad in workcell.contacts]
@@ -171,10 +178,10 @@ def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _robust_forces(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the peak robust force of each arm (n, 2) over its reference force.
+    """Compute the peak robust force (n, 2) of each arm over its reference force.
 
-    Arm 1 leads; arm 2 presses with the commanded force (`hybrid_opt.robust`). If the timing limits
-    robust forces, the peaks are those of the whole path, else of the samples.
+    Arm 1 leads; arm 2 presses with the commanded force (`hybrid_opt.robust`). The peaks are those
+    of the whole path if the timing limits robust forces, else those of the samples.
     """
     if "robust_force" in outputs:
         return np.asarray(outputs["robust_force"] / workcell.task.reference_force)
@@ -190,8 +197,11 @@ def _robust_forces(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def duration_unit(workcell: Workcell) -> float:
-    """Compute the time [s] that the objective `duration` counts as one: twice the time along the
-    straight pieces of the hand-made trajectory at the reference speeds."""
+    """Compute the duration [s] for which the objective `duration` is 1.
+
+    It is twice the time along the straight pieces of the hand-made trajectory at the reference
+    speeds.
+    """
     return 2.0 * workcell.task.initial_time
 
 
@@ -244,7 +254,7 @@ OBJECTIVES: dict[str, Objective] = {
 
 
 def objectives() -> dict[str, str]:
-    """Return the objectives that a `Cell` may minimise: titles by name."""
+    """Return the titles of all objectives that a `Cell` may minimise, by name."""
     return {name: objective.title for name, objective in OBJECTIVES.items()}
 
 
@@ -252,8 +262,9 @@ _ROBUST = tuple(OBJECTIVES[name].evaluate for name in ("robust_force", *ROBUST_O
 
 
 def force_kind(objectives: Sequence[str | Objective]) -> ForceKind:
-    """Return the kind of force that drivable cells limit: robust if a robust force is minimised,
-    else planned.
+    """Return the kind of force that drivable cells limit.
+
+    It is the robust force if an objective minimises a robust force, else the planned force.
 
     Raises:
         SettingsError: an objective is unknown or given twice, or none is given.
@@ -264,7 +275,10 @@ def force_kind(objectives: Sequence[str | Objective]) -> ForceKind:
 
 
 def select_objectives(wanted: Sequence[str | Objective]) -> tuple[Objective, ...]:
-    """Return the objectives in the given order, names replaced by their records in `OBJECTIVES`.
+    """Return objectives as records, in the given order.
+
+    Args:
+        wanted: names of objectives in `OBJECTIVES`, or records.
 
     Raises:
         SettingsError: a name is unknown or given twice, or none is given.
