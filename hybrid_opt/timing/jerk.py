@@ -117,14 +117,18 @@ def time_with_jerk(
 
 
 def applicable_jerk_limits(workcell: Workcell, limits: TimingLimits) -> JerkLimits | None:
-    """Return the workcell's jerk limits for timings within `limits`; None if the workcell has no
-    jerk limits, or if `limits` bound robust forces without derivatives."""
+    """Return the workcell's jerk limits if timings within `limits` can be computed with them.
+
+    None if the workcell has no jerk limits, or if `limits` bound robust forces of a contact model
+    without derivatives of these.
+    """
     slopes = command_model(workcell).has_scalar_squeeze or not limits.robust
     return JerkLimits.from_workcell(workcell) if slopes else None
 
 
 class _JerkProblem:
-    """Timing of one path with one set of limits."""
+    """Timing of one path within one set of limits, with k spline coefficients c of v as
+    variables."""
 
     def __init__(
         self, model: TimingModel, motion: PathMotion, limits: TimingLimits, jerk: JerkLimits
@@ -137,8 +141,12 @@ class _JerkProblem:
         )
 
     def solve(self) -> JerkTiming:
-        """Iterate until the duration settles. Repeat with tighter limits where the result exceeds
-        limits between the points, as long as that helps."""
+        """Solve programs until the duration settles, then check the result between the coarse
+        points.
+
+        Where the result exceeds a limit there, the limits of the neighbouring coarse points are
+        tightened and the programs solved again, a few times at most.
+        """
         c = np.ones(self._coarse.value.shape[1])
         c, rounds = self._iterate(self._start_factor(c) * c)
         for _ in range(MAX_TIGHTENINGS):
@@ -152,7 +160,8 @@ class _JerkProblem:
         return replace(self._checked_timing(c), rounds=rounds)
 
     def _iterate(self, c: Array) -> tuple[Array, int]:
-        """Iterate from feasible coefficients; return the last ones and the number of iterations."""
+        """Solve programs from feasible coefficients c (k,) until the duration settles. Return the
+        last coefficients (k,) and the number of programs solved."""
         duration = self._coarse.duration(c)
         for rounds in range(1, MAX_JERK_ITERATIONS + 1):
             found = self._step(c)
@@ -202,8 +211,8 @@ class _JerkProblem:
             rows.add_norm_bounds(A / limit, np.zeros((len(at.s), 3)), none, at.keep, first_basis)
 
     def _force_rows(self, c: Array, rows: JerkProgram) -> None:
-        """Add limits on normal forces, planned and robust, joint torques and shifts of the
-        pressure, linearised at c."""
+        """Add limits on normal forces, joint torques and shifts of the pressure, linearised at c
+        (k,)."""
         at = self._coarse
         a, w = at.acceleration_by @ c, np.maximum(at.squared_by @ c, 0.0)
         along = np.stack([at.acceleration_by, at.squared_by], axis=1)[:, None]
@@ -219,7 +228,11 @@ class _JerkProblem:
             _add_linearised(at, c, sign * value[:, near], sign * by, rows)
 
     def _jerk_rows(self, c: Array, rows: JerkProgram) -> None:
-        """Limit |jerk| / sqrt(v) by the tangent of (limit / sqrt(v)) at c."""
+        """Add limits on the jerks of joints and payload.
+
+        Each bounds jerk / sqrt(v), which is linear in the coefficients, by the tangent of limit /
+        sqrt(v) at the coefficients c (k,).
+        """
         at, jerk, v = self._coarse, self._jerk, self._coarse.value @ c
         # Multiplied by sqrt(v) of the last round, so that rows are of order one.
         root = np.sqrt(v)
@@ -233,8 +246,8 @@ class _JerkProblem:
             rows.add_norm_bounds(box, np.zeros((len(v), 3)), head, level, at.first_basis)
 
     def _excess(self, c: Array) -> Array:
-        """Return for each coarse point the largest utilisation (n,) of any limit at the finer
-        points next to it."""
+        """Compute for each of n coarse points the largest utilisation (n,) of any limit at the
+        finer points next to it, with coefficients c (k,)."""
         carry = self._model.carry(self._fine.motion, *self._fine.profile(c))
         ratios = self._model.carry_limits.ratios(carry, self._limits)
         del ratios[FRICTION_RATIO]
@@ -244,8 +257,8 @@ class _JerkProblem:
         return np.asarray(np.maximum(np.append(use[0], between), np.append(between, use[-1])))
 
     def _start_factor(self, c: Array) -> float:
-        """Return a factor on the squared speeds of coefficients c at which all limits are little
-        used."""
+        """Return a factor on coefficients c (k,) with which the motion is so slow that all limits
+        are little used."""
         factor = 1.0
         rest = max(self._check(self._coarse, 0.0 * c)[1:])
         allowed = rest + START_UTILISATION * (1.0 - rest)
@@ -254,8 +267,11 @@ class _JerkProblem:
         return factor
 
     def _jerks(self, at: WarpedPath, c: Array) -> tuple[Array, Array]:
-        """Return at each point (n,) the largest joint jerk over its limit, and the payload jerk
-        over its limit."""
+        """Compute jerks over their limits at each of n points, with coefficients c (k,).
+
+        Returns:
+            The largest joint jerk and the payload jerk at each point, (n,) each.
+        """
         joint, box = at.jerk(c)
         stack_joint_limits = (np.abs(joint) / self._jerk.joints).max(axis=1)
         return stack_joint_limits, np.linalg.norm(box, axis=1) / self._jerk.payload
@@ -267,8 +283,8 @@ class _JerkProblem:
         return timing, most_used(timing.use).ratio, joint, box
 
     def _use_by_factor(self, c: Array) -> Callable[[float], float]:
-        """Return the function of a factor on the speeds to the largest utilisation of a limit on
-        the finer grid."""
+        """Return a function that maps a factor on all speeds to the largest utilisation of any
+        limit on the finer grid, with coefficients c (k,)."""
         jerk = max(float(jerk.max()) for jerk in self._jerks(self._fine, c))
 
         def use(f: float) -> float:
@@ -279,8 +295,8 @@ class _JerkProblem:
         return use
 
     def _checked_timing(self, c: Array) -> JerkTiming:
-        """Check the timing of coefficients c on the finer grid, and slow it down if it exceeds a
-        limit."""
+        """Check the timing with coefficients c (k,) on the finer grid, and slow it down uniformly
+        if it exceeds a limit there."""
         factor = largest_speed_factor(self._use_by_factor(c))
         timing, *uses = self._check(self._fine, factor**2 * c)
         status = TimingStatus.OK if factor >= LEAST_SPEED_FACTOR else TimingStatus.NOT_CONVERGED
@@ -294,17 +310,19 @@ class _JerkProblem:
 
 @dataclass(frozen=True)
 class WarpedPath:
-    """Samples of a path along its warped parameter s, and linear maps from the spline's
-    coefficients to the motion at the samples. There are n samples and k coefficients.
+    """A path at n samples of its warped parameter s, with linear maps from spline coefficients to
+    the motion there.
+
+    The k coefficients c are those of v = s'^2, a cubic spline in s.
 
     Attributes:
         s: (n,) warped parameter in [0, 1].
-        value: (n, k) maps coefficients to v = s'^2.
-        squared_by, acceleration_by: (n, k) map coefficients to u'^2 and to u''.
+        value: (n, k) matrix from coefficients to v [1/s^2].
+        squared_by, acceleration_by: (n, k) matrices from coefficients to u'^2 and to u'' [1/s^2].
         motion: geometry of the path at the samples, differentiated by u.
         columns: (n, SPLINE_SUPPORT) indices of the coefficients that influence each sample.
-        joint_jerk_by, box_jerk_by: (n, joints, SPLINE_SUPPORT) and (n, 3, SPLINE_SUPPORT), map
-            these coefficients to jerk / sqrt(v).
+        joint_jerk_by, box_jerk_by: (n, joints, SPLINE_SUPPORT) and (n, 3, SPLINE_SUPPORT), matrices
+            from these coefficients to jerk / sqrt(v).
         keep: (n,) share of every limit that a program may use.
     """
 
@@ -320,7 +338,8 @@ class WarpedPath:
 
     @classmethod
     def from_motion(cls, motion: PathMotion, intervals: int) -> WarpedPath:
-        """Sample a path at the ends of equal intervals of s, both ends of the path included."""
+        """Sample a path at the ends of `intervals` equal intervals of s, both ends of the path
+        included."""
         s, inner = np.linspace(0.0, 1.0, intervals + 1), np.linspace(0.0, 1.0, SPLINE_PIECES + 1)
         knots = np.concatenate([np.zeros(3), inner, np.ones(3)])
         splines = BSpline(knots, np.eye(len(knots) - 4), 3)
@@ -359,17 +378,18 @@ class WarpedPath:
 
     @property
     def first_basis(self) -> NDArray[np.intp]:
-        """Return for each sample (n,) the index of the first coefficient that influences it."""
+        """Index of the first coefficient that influences each sample, (n,)."""
         return self.columns[:, 0]
 
     def local(self, values: Array) -> Array:
-        """Select from values (n, ..., k) the entries (n, ..., SPLINE_SUPPORT) of the coefficients
-        that influence each sample."""
+        """Select from values (n, ..., k) of all coefficients the entries (n, ..., SPLINE_SUPPORT)
+        of those that influence each sample."""
         shape = (len(self.columns), *[1] * (values.ndim - 2), SPLINE_SUPPORT)
         return np.take_along_axis(values, self.columns.reshape(shape), axis=-1)
 
     def duration(self, c: Array) -> float:
-        """Return the duration [s] by Simpson's rule. The number of samples has to be odd."""
+        """Compute the duration [s] with coefficients c (k,) by Simpson's rule, for an odd number of
+        samples."""
         return float(self._weights() @ (1.0 / np.sqrt(np.maximum(self.value @ c, 1e-300))))
 
     def _weights(self) -> Array:
@@ -378,8 +398,12 @@ class WarpedPath:
         return weights / (3.0 * (len(self.s) - 1))
 
     def profile(self, c: Array) -> tuple[Array, Array, Array]:
-        """Return the times [s] of the samples, their path speeds u' [1/s] and accelerations u''
-        [1/s^2], each (n,). The times are s itself if all coefficients are zero (rest)."""
+        """Compute the motion along the path with coefficients c (k,).
+
+        Returns:
+            Times [s] of the samples, path speeds u' [1/s] and path accelerations u'' [1/s^2], (n,)
+            each. The times are s itself if all coefficients are zero (rest).
+        """
         v, time = self.value @ c, self.s
         if v.any():
             slowness = 1.0 / np.sqrt(v)
@@ -388,25 +412,26 @@ class WarpedPath:
         return time, np.sqrt(np.maximum(self.squared_by @ c, 0.0)), self.acceleration_by @ c
 
     def jerk(self, c: Array) -> tuple[Array, Array]:
-        """Return the jerks of the joints (n, joints) [rad/s^3] and of the box frame (n, 3)
-        [m/s^3]."""
+        """Compute the jerks of the joints (n, joints) [rad/s^3] and of the box frame (n, 3) [m/s^3]
+        with coefficients c (k,)."""
         root = np.sqrt(np.maximum(self.value @ c, 0.0))[:, None]
         own = c[self.columns][:, None]
         return root * (self.joint_jerk_by * own).sum(-1), root * (self.box_jerk_by * own).sum(-1)
 
     def objective(self, c: Array) -> tuple[Array, Array]:
-        """Return the gradient (k,) and the Hessian (k, k) of the duration by the coefficients."""
+        """Return gradient (k,) and Hessian (k, k) of the duration by the coefficients, at c
+        (k,)."""
         v, weights = self.value @ c, self._weights()
         gradient = -0.5 * self.value.T @ (weights * v**-1.5)
         return gradient, 0.75 * (self.value.T * (weights * v**-2.5)) @ self.value
 
 
 class JerkProgram:
-    """Quadratic program with linear rows b - A c >= 0 and second-order cones of four such rows
-    each.
+    """Quadratic program of k coefficients c, with linear rows A c <= b and second-order cones.
 
-    Few rows are active at a solution. Each row depends on few neighbouring coefficients, so only
-    these entries of A are stored, beginning at column `first`.
+    A cone bounds the length of a vector (3,) that is affine in c. Few rows are active at a
+    solution. Each row depends on few neighbouring coefficients, so only these entries of A are
+    stored, from the column `first` on.
     """
 
     def __init__(self, k: int) -> None:
@@ -418,15 +443,26 @@ class JerkProgram:
         self._cones = [(sparse.csr_array((0, k)), np.zeros((0, 4)))]
 
     def add_upper_bounds(self, A: Array, b: Array, first: NDArray[np.intp]) -> None:
-        """Add n rows A c <= b. A (n, width) holds the entries from column `first` (n,) on; b is
-        (n,)."""
+        """Add n rows A c <= b.
+
+        Args:
+            A: (n, width) entries from column `first` on.
+            b: (n,) bounds.
+            first: (n,) first column of each row.
+        """
         self._linear.append((self._sparse_rows(A, first), b))
 
     def add_two_sided_bounds(
         self, A: Array, head: Array | float, bound: Array, first: NDArray[np.intp]
     ) -> None:
-        """Add |A c| <= bound - head c for m rows at each of n points: A (n, m, width), head (n, 1,
-        width), bound (n,); entries from column `first` (n,) on."""
+        """Add rows -r <= A c <= r with r = bound - head c, m rows at each of n points.
+
+        Args:
+            A: (n, m, width) entries from column `first` on.
+            head: (n, 1, width) entries of `head`, or 0.
+            bound: (n,) bounds.
+            first: (n,) first column of each point's rows.
+        """
         _, m, width = A.shape
         for sign in (1.0, -1.0):
             each = (sign * A + head).reshape(-1, width)
@@ -435,8 +471,15 @@ class JerkProgram:
     def add_norm_bounds(
         self, A: Array, b: Array, head: Array, bound: Array, first: NDArray[np.intp]
     ) -> None:
-        """Add n cones |A c + b| <= bound - head c: A (n, 3, width), b (n, 3), head (n, width),
-        bound (n,); entries from column `first` (n,) on."""
+        """Add n cones that bound the length of A c + b by bound - head c.
+
+        Args:
+            A: (n, 3, width) entries from column `first` on.
+            b: (n, 3) constant parts.
+            head: (n, width) entries of `head`.
+            bound: (n,) bounds.
+            first: (n,) first column of each cone.
+        """
         rows = np.concatenate([head[:, None], -A], axis=1).reshape(-1, A.shape[2])
         placed = self._sparse_rows(rows, np.repeat(first, 4))
         self._cones.append((placed, np.column_stack([bound, b])))
@@ -451,7 +494,7 @@ class JerkProgram:
 
     @cached_property
     def rows(self) -> tuple[sparse.csr_array, Array, sparse.csr_array, Array]:
-        """Return A and b of all linear rows, then A and b of all cones."""
+        """A and b of all linear rows, then A and b of all cones (four rows each)."""
         from scipy import sparse
 
         A, b = zip(*self._linear, strict=True)
@@ -460,18 +503,23 @@ class JerkProgram:
         return stacked, np.concatenate(b), cones, np.concatenate(cone_b)
 
     def used(self, c: Array, share: float) -> tuple[Mask, Mask]:
-        """Mark the linear rows and the cones of which c uses more than `share` of the bound."""
+        """Mark the linear rows and the cones of which coefficients c (k,) use more than `share` of
+        the bound."""
         A, b, cone_A, cone_b = self.rows
         inside = cone_b - (cone_A @ c).reshape(-1, 4)
         lengths = np.linalg.norm(inside[:, 1:], axis=1)
         return np.asarray(A @ c > share * b), np.asarray(lengths > share * inside[:, 0])
 
     def minimise(self, H: Array, g: Array, about: Array) -> Array | None:
-        """Minimise c^T H c / 2 + g.c, and solve again with the violated rows added until no row is
+        """Minimise c^T H c / 2 + g . c over coefficients c (k,).
+
+        The program is solved with few rows, and again with the violated rows added, until no row is
         violated.
 
         Args:
-            about: coefficients (k,) near the solution; rows that they nearly use enter at once.
+            H: (k, k) matrix of the objective.
+            g: (k,) vector of the objective.
+            about: (k,) coefficients near the solution; rows that they nearly use enter at once.
 
         Returns:
             Coefficients (k,), or None if the solver fails.
@@ -490,8 +538,9 @@ class JerkProgram:
     def _solve_subset(
         self, H: Array, g: Array, scale: Array, rows: Mask, cones: Mask
     ) -> Array | None:
-        """Minimise subject to the marked rows and cones only; `scale` brings variables to about
-        one."""
+        """Minimise c^T H c / 2 + g . c subject to the marked rows and cones only; None if the
+        solver fails. The solver's variables are c / `scale`, with sizes (k,) of the coefficients.
+        """
         # Not imported at the top: only jerk limits need it.
         import clarabel
         from scipy import sparse
@@ -518,14 +567,15 @@ class JerkProgram:
 
 
 def _add_linearised(at: WarpedPath, c: Array, value: Array, by: Array, rows: JerkProgram) -> None:
-    """Add rows that limit values, linearised at c, to one: value + by (c_new - c) <= 1. A value
-    that exceeds one at c gets a row that allows the same excess.
+    """Add rows value + by (c_new - c) <= 1 for limited values, linearised at coefficients c.
+
+    A value that exceeds one at c gets a row that allows the same excess.
 
     Args:
         at: samples of the path.
         c: (k,) coefficients.
-        value: (n, m) values over their limits at c.
-        by: (n, m, k) derivatives of the values.
+        value: (n, m) values at c over their limits.
+        by: (n, m, k) derivatives of the values by the coefficients.
         rows: program that gets the rows.
     """
     bound = np.maximum(at.keep[:, None], value) - value + by @ c

@@ -21,10 +21,11 @@ LINEARISED_ABOVE = 0.6
 
 
 class PathLimits:
-    """Limits at n samples of a path, as functions of u'' and u'^2, each divided by its bound.
+    """Limits at n samples of a path as functions of u'' and u'^2, each divided by its bound.
 
-    Limits on speeds are in `squared_speed_limit` instead. If a contact model has no scalar squeeze
-    (`ContactModel.has_scalar_squeeze`), its robust forces belong to `ratios`, else to `forces`.
+    Limits on speeds are not among them; `squared_speed_limit` computes these. Robust forces are
+    part of `forces` if the contact model has a scalar squeeze (`ContactModel.has_scalar_squeeze`),
+    else of `ratios`.
 
     Attributes:
         motion: geometry of the path at the samples.
@@ -38,15 +39,21 @@ class PathLimits:
         self._grasped = limits.robust and not self._squeezed
 
     def joint_accelerations(self) -> tuple[Array, Array]:
-        """Return the derivatives (n, all joints) of the joint accelerations by u'' and by u'^2,
-        over the limits. The limits apply to both signs."""
+        """Return the derivatives of the joint accelerations, over their limits, by u'' and by u'^2.
+
+        Both are (n, all joints). The limits apply to both signs.
+        """
         first, second = self._derivatives(JOINT_ACCELERATION)
         bound = self._bounds[JOINT_ACCELERATION.name]
         return first / bound, second / bound
 
     def accelerations(self) -> list[tuple[Array, Array, float]]:
-        """Return for each limit on the payload's acceleration its derivatives (n, 3) by u'' and by
-        u'^2, and the bound on its length."""
+        """Return the limits on the payload's acceleration, linear and angular.
+
+        Returns:
+            For each limit the derivatives (n, 3) of the acceleration by u'' and by u'^2, and the
+            largest allowed length of the acceleration [m/s^2 or rad/s^2].
+        """
         return [
             (first[:, :3], second[:, :3], float(self._bounds[limit.name]))
             for limit in PAYLOAD_ACCELERATIONS
@@ -58,7 +65,7 @@ class PathLimits:
         return getattr(m, f"{name}_first"), getattr(m, f"{name}_second")
 
     def forces(self, a: Array, w: Array) -> list[tuple[Array, Array]]:
-        """Compute normal forces that are convex in (u'', u'^2), over the force limit.
+        """Compute the normal forces that are convex in (u'', u'^2), over the force limit.
 
         Args:
             a, w: (n,) values of u'' [1/s^2] and u'^2 [1/s^2].
@@ -77,8 +84,17 @@ class PathLimits:
         return [(force / limit, slope / limit) for force, slope in found]
 
     def ratios(self, a: Array, w: Array) -> Array:
-        """Compute the quantities that are not convex in (u'', u'^2), over their limits and with
-        sign (n, k), at u'' = a (n,) and u'^2 = w (n,)."""
+        """Compute the limited quantities that are not convex in (u'', u'^2), over their limits.
+
+        These are joint torques with sign, pressure shifts and, without a scalar squeeze, robust
+        forces.
+
+        Args:
+            a, w: (n,) values of u'' [1/s^2] and u'^2 [1/s^2].
+
+        Returns:
+            (n, k) ratios.
+        """
         m, workcell, limits = self.motion, self._model.workcell, self._limits
         pressure = limits.pressure and self._model.carry_limits.has_pressure_limit
         force = limits.force if self._grasped else None
@@ -99,11 +115,11 @@ class PathLimits:
         return np.concatenate(columns, axis=1)
 
     def ratio_slopes(self, ratios: Array, a: Array, w: Array) -> Array:
-        """Compute the derivatives (n, k, 2) of the method `ratios` by u'' and by u'^2, by forward
+        """Compute the derivatives (n, k, 2) of `PathLimits.ratios` by u'' and by u'^2, by forward
         differences.
 
         Args:
-            ratios: (n, k) result of the method at a and w.
+            ratios: (n, k) result of `PathLimits.ratios` at a and w.
             a, w: (n,) values of u'' [1/s^2] and u'^2 [1/s^2].
         """
         step_a = 1e-5 * max(float(np.abs(a).max()), 1e-6)
@@ -117,8 +133,15 @@ class PathLimits:
 
 
 def squared_speed_limit(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> Array:
-    """Return the largest u'^2 (n,) [1/s^2] that all limits on speeds allow; infinite where nothing
-    moves."""
+    """Compute the largest u'^2 (n,) [1/s^2] at each sample that all limits on speeds allow.
+
+    It is infinite where nothing moves.
+
+    Args:
+        model: timing model of the workcell.
+        motion: geometry of the path at n samples.
+        limits: limits in addition to the workcell's, such as the reference speeds.
+    """
     task, bounds = model.workcell.task, model.carry_limits.bounds
     demands = []
     for limit in SPEEDS:
@@ -139,8 +162,8 @@ def squared_speed_limit(model: TimingModel, motion: PathMotion, limits: TimingLi
 
 
 def duration_at_speed_limits(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> float:
-    """Return the duration [s] of a path that is driven at its speed limits throughout,
-    accelerations unlimited."""
+    """Compute the duration [s] of a path that is driven at its speed limits throughout, without
+    limits on accelerations."""
     squared = squared_speed_limit(model, motion, limits)
     slowness = 1.0 / np.sqrt(np.minimum(squared, 1e8))
     return float(np.trapezoid(slowness, motion.parameter))

@@ -54,10 +54,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class PathMotion:
-    """Geometry of the path of a decision vector x (n_var,) at n samples of the path parameter.
+    """Geometry of one path at n samples of the path parameter u.
 
-    Arrays have one row per sample; joints of both arms are stacked. The names are the outputs of
-    `symbolic.path_motion`; `_first` and `_second` are derivatives by the path parameter.
+    Fields are described in `symbolic.path_motion` and `symbolic.robot.arm` under the same names.
+    `_first` and `_second` mark derivatives by u; joints of both arms stand side by side.
+
+    Attributes:
+        x: (n_var,) decision vector.
+        parameter: (n,) u in [0, 1].
+        pose: (n, 6) box poses [m, rad].
+        q: (n, all joints) joint positions [rad].
+        lost, limit_margin, manipulability: (n, 2) quantities of both arms.
     """
 
     x: Array
@@ -83,12 +90,12 @@ class PathMotion:
     manipulability: Array
 
     def at(self, samples: NDArray[np.intp]) -> PathMotion:
-        """Return the geometry at the samples with these indices, in this order."""
+        """Select the samples with the given indices, in this order."""
         sampled = {f.name: getattr(self, f.name)[samples] for f in fields(self) if f.name != "x"}
         return PathMotion(self.x, **sampled)
 
     def interpolate(self, u: Array) -> PathMotion:
-        """Interpolate the geometry at parameters u (n,) in [0, 1] by cubic splines."""
+        """Interpolate the geometry at path parameters u (m,) in [0, 1] by cubic splines."""
         spline, parts = self._spline
         values = np.split(spline(u), parts, axis=1)
         shaped = {
@@ -98,16 +105,16 @@ class PathMotion:
         return PathMotion(self.x, u, **shaped)
 
     def third_derivatives(self, u: Array) -> tuple[Array, Array]:
-        """Return the third derivatives of the joints (n, joints) and of the box position (n, 3) by
-        the path parameter, at parameters u (n,)."""
+        """Return the third derivatives of the joint positions (m, all joints) and of the box
+        position (m, 3) by the path parameter, at path parameters u (m,)."""
         joints = self.q_second.shape[1]
         both = self._third(u)
         return both[:, :joints], both[:, joints : joints + 3]
 
     @cached_property
     def _spline(self) -> tuple[CubicSpline, Array]:
-        """Return one spline through all quantities side by side, and the first column of each
-        quantity from the second on."""
+        """One spline through all quantities side by side, and the first column of each quantity but
+        the first."""
         u = self.parameter[::_SPLINE_EVERY]
         columns = [
             getattr(self, name)[::_SPLINE_EVERY].reshape(len(u), -1) for name in SAMPLED_FIELDS
@@ -149,13 +156,14 @@ class CarryLimits:
         self._friction = np.array([contact.friction for contact in workcell.contacts])
 
     def applies(self, limit: Limit, limits: TimingLimits) -> bool:
-        """Return True if the limit of the table `LIMITS` applies to timings within `limits`."""
+        """Return True if an entry of the table `symbolic.limits.LIMITS` applies to timings with the
+        options `limits`."""
         if limit.option == "pressure":
             return limits.pressure and self.has_pressure_limit
         return not limit.option or bool(getattr(limits, limit.option))
 
     def ratios(self, carry: Carry, limits: TimingLimits) -> dict[str, Array]:
-        """Compute every limited quantity over its limit at every sample of a carry.
+        """Compute every limited quantity over its limit at n samples of a carry.
 
         Returns:
             Ratios by name: friction, and each limit of `symbolic.limits.LIMITS` that applies.
@@ -187,8 +195,8 @@ class CarryLimits:
         return ratios
 
     def limited_force(self, carry: Carry, limits: TimingLimits) -> Array:
-        """Return the normal forces (n, 2) [N] that the force limit bounds: the planned ones; with a
-        robust limit the larger of planned and robust."""
+        """Return the normal forces (n, 2) [N] to which the force limit applies: planned forces; if
+        robust forces are limited, the larger ones of planned and robust forces."""
         if not limits.robust:
             return carry.normal_force
         workcell = self.workcell
@@ -196,10 +204,10 @@ class CarryLimits:
         return np.maximum(carry.normal_force, np.stack([leading, commanded], axis=1))
 
     def _near_limit(self, carry: Carry, limits: TimingLimits) -> Array:
-        """Compute `limited_force`, with exact robust forces only near the limit.
+        """Compute `limited_force` (n, 2) [N], exactly only for forces near the limit or the largest
+        force.
 
-        Robust forces below both `EXACT_FORCE_ABOVE` of the limit and the carry's largest force are
-        replaced by the planned forces. This takes a fraction of the time.
+        Elsewhere robust forces are replaced by planned ones. This takes a fraction of the time.
         """
         if not limits.robust or limits.force is None:
             return self.limited_force(carry, limits)
@@ -227,11 +235,11 @@ def _bound_of(limit: Limit, workcell: Workcell) -> Array:
 def _robust_forces_above(
     level: float, points: PathPoints, path: RobustPath, found: Array, every: int = 1
 ) -> bool:
-    """Compute the robust forces above a level [N] at every `every`-th point, and raise the entries
-    of `found` (n, 2) [N] to them.
+    """Raise the entries of `found` (n, 2) [N] to those robust forces at n points that exceed a
+    level [N]. Only every `every`-th point is looked at.
 
     Returns:
-        True if there are any.
+        True if any robust force exceeds the level.
     """
     known, rows = False, np.arange(0, len(points), every)
     for part in np.array_split(rows, -(-len(rows) // ROBUST_BATCH)):
@@ -324,8 +332,9 @@ class TimingModel:
         return self._latest
 
     def path_coefficients(self, motion: PathMotion) -> dict[str, Array]:
-        """Return the input of the compiled passes for one path: the coefficients of its limits and
-        its poses, at both ends and in the middle of every interval."""
+        """Return the input of the compiled passes for one path: coefficients of the limits and
+        extended poses with two derivatives by u, at both ends and in the middle of every interval.
+        It is the argument `paths` of `ForwardBackwardPasses.time` with n = 1."""
         task, some = self.workcell.task, slice(None, None, REFINEMENT // 2)
         box = (motion.pose, motion.pose_first, motion.pose_second)
         joints = (motion.q, motion.q_first, motion.q_second)
@@ -342,16 +351,22 @@ class TimingModel:
         return {"limits": rows[None]} | poses
 
     def load(self, pose: Array, rate: Array, second_rate: Array) -> dict[str, Array]:
-        """Compute the loads of a box motion: the outputs `symbolic.contact.load.LOAD_OUTPUTS`.
+        """Compute the outputs `symbolic.contact.load.LOAD_OUTPUTS` for a motion of the box.
 
         Args:
-            pose, rate, second_rate: (n, 6) box pose and its first and second derivative by time.
+            pose, rate, second_rate: (n, 6) box poses [m, rad], and their first and second
+                derivatives by time.
         """
         return self._functions["load"].batch(pose, rate, second_rate)
 
     def path_force(self, motion: PathMotion, a: Array, w: Array) -> tuple[Array, Array]:
-        """Compute the planned normal forces (n, 2) [N] at u'' = a (n,) and u'^2 = w (n,), and their
-        slopes (n, 2, 2) by (u'', u'^2)."""
+        """Compute the planned normal forces (n, 2) [N] at n samples of a path, and their slopes (n,
+        2, 2) by (u'', u'^2).
+
+        Args:
+            motion: geometry of the path.
+            a, w: (n,) values of u'' [1/s^2] and u'^2 [1/s^2].
+        """
         path = (motion.pose, motion.pose_first, motion.pose_second)
         found = self._functions["path_force"].batch(*path, a, w)
         return found["normal_force"], found["slope"]
@@ -359,8 +374,8 @@ class TimingModel:
     def uncertain_load(
         self, carry: Carry, friction: Array, centre_of_mass: Array
     ) -> dict[str, Array]:
-        """Compute the loads of a carry with changed friction coefficients (2,) and centre of mass
-        (3,) in the box frame [m]."""
+        """Compute the outputs `symbolic.contact.load.LOAD_OUTPUTS` of a carry with changed friction
+        coefficients (2,) and a changed centre of mass (3,) in the box frame [m]."""
         return self._functions["uncertain_load"].batch(
             carry.pose, carry.rate, carry.second_rate, friction, centre_of_mass
         )
@@ -384,7 +399,8 @@ class TimingModel:
         return self._functions[f"arm_{arm + 1}"].batch(np.ascontiguousarray(q), *motion, still)
 
     def wrench_torque(self, q: Array, pose: Array) -> Array:
-        """Compute the matrices (n, all joints, 6) from contact wrenches to joint torques.
+        """Compute matrices (n, all joints, 6) that map each arm's contact wrench to its joint
+        torques.
 
         Args:
             q: (n, all joints) joint positions [rad].
@@ -396,8 +412,9 @@ class TimingModel:
         return np.concatenate(matrices, axis=1)
 
     def drive(self, motion: PathMotion, speed: Array, acceleration: Array) -> dict[str, Array]:
-        """Compute the loads of a path that is driven with u' (n,) and u'' (n,) at the samples of
-        `motion`. Joint torques are not among them; `contact_torque` computes these."""
+        """Compute the outputs `symbolic.contact.load.LOAD_OUTPUTS` of a path that is driven with u'
+        (n,) [1/s] and u'' (n,) [1/s^2]. Joint torques are not among them; `contact_torque` computes
+        these."""
         rate = motion.pose_first * speed[:, None]
         second = motion.pose_second * speed[:, None] ** 2 + (
             motion.pose_first * acceleration[:, None]
@@ -405,13 +422,14 @@ class TimingModel:
         return self.load(motion.pose, rate, second)
 
     def contact_torque(self, wrench_torque: Array, load: Mapping[str, Array]) -> Array:
-        """Compute the joint torques (n, all joints) [N m] that exert the contact wrenches of
-        `load`."""
+        """Compute the joint torques (n, all joints) [N m] that exert the contact wrenches among the
+        outputs `load`, with the matrices (n, all joints, 6) of `wrench_torque`."""
         wrenches = (load["wrench_1"], load["wrench_2"])
         return contact_torque(len(self.joint_names[0]), wrench_torque, wrenches)
 
     def carry(self, motion: PathMotion, time: Array, speed: Array, acceleration: Array) -> Carry:
-        """Return the carry at the samples of `motion` with times, u' and u'' (n,) each."""
+        """Return the carry that drives a path with given times (n,) [s], path speeds u' (n,) [1/s]
+        and path accelerations u'' (n,) [1/s^2] at the samples of `motion`."""
         load = self.drive(motion, speed, acceleration)
         v, w, a = speed[:, None], speed[:, None] ** 2, acceleration[:, None]
         own = motion.torque_by_acceleration * a + motion.torque_by_speed * w
@@ -469,11 +487,13 @@ class TimingModel:
 
 @dataclass(frozen=True)
 class SpeedProfile:
-    """Path speeds with constant u'' on intervals, at `REFINEMENT` samples per interval. Both ends
-    of every interval are samples.
+    """Path speeds at the samples of a `PathMotion`, with constant u'' on every interval.
+
+    There are `REFINEMENT` + 1 samples per interval: both of its ends are samples, so an inner grid
+    point occurs twice.
 
     Attributes:
-        index: (n,) index of each sample among the samples of a `PathMotion`.
+        index: (n,) index of each sample in the `PathMotion`.
         time: (n,) [s].
         share: (n,) position of each sample within its interval, in [0, 1].
         a, w: (n,) path acceleration u'' [1/s^2] and squared path speed u'^2 [1/s^2].
@@ -487,8 +507,8 @@ class SpeedProfile:
 
     @classmethod
     def from_grid_speed(cls, grid_speed: Array) -> SpeedProfile:
-        """Return the profile with the path speeds u' (intervals + 1,) at the grid points [1/s], and
-        constant u'' between them."""
+        """Return the profile with given path speeds u' (intervals + 1,) [1/s] at the grid points,
+        and constant u'' between them."""
         squared, intervals = grid_speed**2, len(grid_speed) - 1
         share = np.linspace(0.0, 1.0, REFINEMENT + 1)
         w = squared[:-1, None] + np.outer(np.diff(squared), share)
@@ -509,8 +529,10 @@ class SpeedProfile:
     def carry(
         self, model: TimingModel, motion: PathMotion, a: float = 0.0, w: float = 0.0
     ) -> Carry:
-        """Return the carry of a path at these speeds. Optionally add `a` to every u'' and `w` to
-        every u'^2."""
+        """Return the carry that drives a path at these speeds.
+
+        The numbers `a` and `w` are added to every u'' and every u'^2 [1/s^2].
+        """
         speed = np.sqrt(np.maximum(self.w + w, 0.0))
         return model.carry(motion.at(self.index), self.time, speed, self.a + a)
 
