@@ -36,16 +36,17 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Grip:
-    """A place of both pads on their faces.
+    """A place of both pads on their faces of the box, and the effort of the hand-made path with it.
 
     Attributes:
         cell: the cell with the pads at this place, and nothing else changed.
-        up, along: shift of the pads from their former place, upwards and level along the faces [m].
-        duration: duration of the hand-made path at the least product of duration and commanded
-            force, without limits on jerk [s].
-        force: commanded force at this duration [N].
-        before: least product with the pads at their former place [N s]; infinite if the pads did
-            not hold there.
+        up, along: shift of the pads from their place in the file, upwards and level along their
+            faces [m].
+        duration: duration of the hand-made path [s] at the least product of duration and commanded
+            force, limits on jerk ignored.
+        force: largest commanded force at this duration [N].
+        before: least product of duration and commanded force with the pads at their place in the
+            file [N s]; infinite if the path could not be driven.
     """
 
     cell: Cell
@@ -67,8 +68,8 @@ class Grip:
 def propose_grip(
     cell: Cell, up: Range, along: Range, trials: int = TRIALS, *, progress: ShowProgress = False
 ) -> Grip:
-    """Find the place of the pads at which the cell's hand-made path has the least product of
-    duration and force, and certify the path with this place.
+    """Find the place of both pads on their faces at which the cell's hand-made path has the least
+    product of duration and commanded force. The path with this place is certified.
 
     Args:
         cell: cell with pads on upright faces, and forces in closed form.
@@ -130,7 +131,8 @@ def propose_grip(
 
 
 def _ways(workcell: Workcell) -> Array:
-    """Compute the directions (2, 3) upwards and level along the faces, box axes, at the start.
+    """Compute the directions along the pads' faces in the box frame (2, 3): upwards at the start,
+    then level.
 
     Raises:
         SettingsError: the faces are not upright.
@@ -145,8 +147,13 @@ def _ways(workcell: Workcell) -> Array:
 
 
 def _changes(workcell: Workcell, ways: Array, at: tuple[float, float]) -> dict[str, Any]:
-    """Return the changes of the workcell file that put the pads at a place, by key path as for
-    `Cell.changed`."""
+    """Return the changes of the workcell file that shift all pads along their faces, by key path as
+    for `Cell.changed`.
+
+    Args:
+        ways: (2, 3) unit vectors in the box frame, upwards and level.
+        at: shift along each of these vectors [m].
+    """
     if at == (0.0, 0.0):
         return {}
     pads = {
@@ -165,8 +172,17 @@ def _changes(workcell: Workcell, ways: Array, at: tuple[float, float]) -> dict[s
 
 
 def _cost(drivable: Cell, changes: dict[str, Any]) -> tuple[float, float, float]:
-    """Return the least product of duration and commanded force [N s], the duration [s] and the
-    force [N] of the changed cell's path; all infinite if it cannot be driven."""
+    """Compute the least product of duration and commanded force of the hand-made path in a changed
+    cell.
+
+    Args:
+        drivable: the cell.
+        changes: changes of the cell by key path, as for `Cell.changed`.
+
+    Returns:
+        The product [N s], the duration [s] and the force [N]; all infinite if the path cannot be
+        driven.
+    """
     none = np.inf, np.inf, np.inf
     try:
         cell = drivable.changed(changes) if changes else drivable

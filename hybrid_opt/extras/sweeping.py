@@ -47,12 +47,12 @@ _OTHER_FILE = "remove it, or name another file"
 
 @dataclass(frozen=True)
 class Combination:
-    """The carry of one combination of numbers.
+    """Recommended carry of a cell with one combination of changed values.
 
     Attributes:
-        values: values of the changed numbers by key, in the order of the sweep.
+        values: the changed values, in the order of the sweep's keys.
         duration: duration of the carry [s]; NaN if there is no carry.
-        force: largest commanded force of the carry [N]; NaN if there is no carry.
+        force: largest commanded normal force of the carry [N]; NaN if there is no carry.
         x: (n_var,) decision vector of the carry; empty if there is no carry.
         remark: reason why there is no carry, or an objection to the carry.
     """
@@ -66,13 +66,14 @@ class Combination:
 
 @dataclass(frozen=True)
 class Sweep:
-    """Result of a sweep, as stored.
+    """Result of a sweep: one row for each combination of values, as stored.
 
     Attributes:
-        about: digest of the cell, of what it minimises, and of whether the path is fixed.
-        over: swept values by key.
-        x: (n_var,) decision vector of the unchanged cell's carry, the start of the sweep.
-        rows: finished combinations; the last key varies fastest.
+        about: digest of the cell, its objectives, and whether the path is fixed.
+        over: values of each key that are combined.
+        x: (n_var,) decision vector of a good carry of the unchanged cell, where each combination
+            starts.
+        rows: results of the finished combinations; the last key varies fastest.
     """
 
     about: str
@@ -121,18 +122,18 @@ def sweep(
     jobs: int = 1,
     progress: ShowProgress = False,
 ) -> Sweep:
-    """Compute the recommended carry's duration and force for every combination of some numbers of a
-    cell.
+    """Compute duration and commanded force of the recommended carry for every combination of values
+    of a cell.
 
     Args:
         cell: drivable cell, see `Cell.drivable`.
         path: good carry of the cell, such as the recommended one, or the carry's decision vector.
-        over: values by key path, see `Cell.changed`.
+        over: values to combine, by key path as for `Cell.changed`.
         fixed: True to keep the path; False to polish the path in every changed cell.
         file: file that stores finished combinations, to resume the sweep; None for no file.
         jobs: number of worker processes, 0 for one per core; has no influence on the result.
-        progress: True for a progress bar, or a function of the numbers of done and of all
-            combinations.
+        progress: True for a progress bar, or a function that is called with the number of finished
+            combinations and their total.
 
     Raises:
         SettingsError: the cell has another time law, the path does not fit it, there are no values,
@@ -173,14 +174,14 @@ def sweep(
 
 
 class _Chains:
-    """The combinations of a sweep, arranged in chains in which only the last key varies, with the
-    finished results.
+    """Combinations of a sweep with the results so far, arranged in chains. Within a chain only the
+    value of the last key varies.
 
     Attributes:
-        sweep: the sweep with the finished results, in the order of the sweep.
+        sweep: the results in the order of the sweep.
         size: number of all combinations.
         columns: values of the last key.
-        done: finished results by the values of their combinations.
+        done: results by the values of their combinations.
     """
 
     def __init__(self, known: Sweep, file: Path | None) -> None:
@@ -192,13 +193,13 @@ class _Chains:
         self._write()
 
     def left(self, column: float) -> list[tuple[float, ...]]:
-        """Return the combinations with this value of the last key that are not finished."""
+        """Return the unfinished combinations whose last key has the value `column`."""
         every = [(*head, column) for head in self._heads]
         return [values for values in every if values not in self.done]
 
     def near(self, values: tuple[float, ...]) -> Array | None:
-        """Return the decision vector of the nearest finished combination before this one in its
-        chain that has a carry, None if there is none."""
+        """Return the decision vector (n_var,) of the carry that was found for the nearest
+        combination before this one in its chain; None if there is none."""
         *head, last = values
         for value in reversed(self.columns[: self.columns.index(last)]):
             if len(x := self.done[*head, value].x):
@@ -240,8 +241,8 @@ _LOADED: dict[tuple[Any, ...], Cell] = {}
 
 
 def _loaded(cell: Cell) -> Cell:
-    """Return the cell kept from an earlier call in this process if it equals the given one, else
-    the given cell."""
+    """Return the equal cell that is kept from an earlier call in this process, if there is one,
+    else the given cell. So its functions are loaded once."""
     key = cell.workcell.digest, *cell.objectives
     if key not in _LOADED:
         _LOADED.clear()
@@ -252,8 +253,13 @@ def _loaded(cell: Cell) -> Cell:
 def _next_row(
     request: _Request, combination: tuple[tuple[float, ...], Array | None]
 ) -> Combination:
-    """Compute the result of a combination. `combination` holds the values and the decision vector
-    of the nearest combination with a carry, or None."""
+    """Compute the result of one combination.
+
+    Args:
+        request: data that all combinations share.
+        combination: the values, and the decision vector (n_var,) of the carry of a similar
+            combination, or None.
+    """
     numbers, near = combination
     known = [request.x] if near is None or request.fixed else [request.x, near]
     values = dict(zip(request.keys, numbers, strict=True))
@@ -281,8 +287,14 @@ def _row(
 
 
 def _tried(cell: Cell, near: Sequence[Array], fixed: bool) -> Evaluations:
-    """Evaluate paths, and the hand-made path unless the path is fixed, each with its best force
-    limit."""
+    """Evaluate paths in a changed cell, each with its best force limit. The hand-made path is added
+    unless the path is fixed.
+
+    Args:
+        cell: the changed cell.
+        near: decision vectors (n_var,) of the paths.
+        fixed: True if the path is kept.
+    """
     x = np.array([x[:-1] for x in (near if fixed else [*near, cell.initial])])
     paths = DrivenPaths(cell, x)
     options = paths.all_options(cell.workcell.task.force_limit[1])

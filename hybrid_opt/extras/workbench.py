@@ -45,13 +45,13 @@ FIRST = 39
 
 @dataclass(frozen=True)
 class Handle:
-    """A draggable part of a cell.
+    """A part of a cell that can be dragged to another pose.
 
     Attributes:
         key: key in the workcell file: 'task.start', 'environment.top board', 'robots[0].base' or
             'contacts[0]'.
-        title: its name for people.
-        pose: (4, 4) pose in the world.
+        title: name of the part for people.
+        pose: (4, 4) pose of the part in the world.
         turns: True if the part may be rotated; a pad stays on its face.
     """
 
@@ -63,15 +63,16 @@ class Handle:
 
 @dataclass(frozen=True, eq=False)
 class SessionVerdict:
-    """Verdict on a carry in a changed cell.
+    """Result of evaluating a carry in a changed cell.
 
     Attributes:
-        cell: the changed cell as a drivable one; None if the change is refused.
+        cell: the changed cell in its drivable form; None if the change is refused.
         carry: the carry in the changed cell; None if the change is refused.
         text: verdict as a text, with the reason if the carry is not feasible.
         feasible: True if the carry is feasible.
-        commanded: (n, 2) commanded normal forces [N]; None if the carry is not feasible.
-        squeeze: origin of the commanded forces.
+        commanded: (n, 2) commanded normal force of each arm at the samples [N]; None if the carry
+            is not feasible.
+        squeeze: how the commanded forces were chosen; None if there are none.
         seconds: computing time of the verdict [s].
     """
 
@@ -85,17 +86,17 @@ class SessionVerdict:
 
 
 class Session:
-    """A cell with interactive changes, and the carry under evaluation.
+    """A cell that is changed interactively, and one carry that is evaluated after each change.
 
     Attributes:
         base: the unchanged cell.
-        changes: by key path of the workcell file, see `Cell.changed`.
-        x: (n_var,) decision vector of the carry in a drivable cell.
-        verdict: the verdict on that carry.
+        changes: changed values by key path of the workcell file, as for `Cell.changed`.
+        x: (n_var,) decision vector of the carry in the drivable form of the cell.
+        verdict: result of the last evaluation.
     """
 
     def __init__(self, cell: Cell, x: Array | None = None) -> None:
-        """Open a session and evaluate its first carry.
+        """Open a session and evaluate its carry.
 
         Args:
             cell: the cell.
@@ -117,11 +118,12 @@ class Session:
         return self.verdict.cell or self._drivable
 
     def change(self, changes: Mapping[str, Any]) -> SessionVerdict:
-        """Apply more changes; a refused change leaves the session as it is.
+        """Change the cell further and evaluate the carry. A refused change leaves the session
+        unchanged.
 
         Args:
-            changes: new values by key path of the workcell file; the key 'force_limit' is the
-                force limit of the carry [N].
+            changes: new values by key path of the workcell file; the key 'force_limit' stands for
+                the force limit of the carry [N].
         """
         begin = time.perf_counter()
         wanted = self.changes | dict(changes)
@@ -140,7 +142,12 @@ class Session:
         return self.verdict
 
     def move(self, handle: Handle, pose: Array) -> SessionVerdict:
-        """Move a draggable part, a handle, to another pose (4, 4) in the world."""
+        """Move a part of the cell and evaluate the carry.
+
+        Args:
+            handle: the part.
+            pose: (4, 4) its new pose in the world.
+        """
         return self.change(moved(self.cell.workcell, handle, pose))
 
     def optimise(
@@ -168,8 +175,11 @@ class Session:
         return self.verdict
 
     def save(self, folder: str | Path) -> Path:
-        """Write the changed cell into a folder of its own, with the present path as its hand-made
-        one and all files that it needs. Return the path of the workcell file.
+        """Write the changed cell into a folder, with all files that it needs and the present carry
+        as its hand-made trajectory. Return the path of the workcell file.
+
+        Args:
+            folder: a folder that is empty or does not exist yet.
 
         Raises:
             DualArmError: the folder is not empty, or cannot be written.
@@ -186,8 +196,8 @@ class Session:
         return unpack_cell(collect_cell(cell.workcell), folder).source
 
     def export(self, target: str, folder: str | Path) -> tuple[Path, ...]:
-        """Write the whole job around the carry as a bundle for robots, and the carry itself as
-        carry.json. Return the paths of the files.
+        """Write the job around the carry as a bundle for robots, and the carry as carry.json.
+        Return the paths of all written files.
 
         Args:
             target: name of the export's target.
@@ -251,8 +261,15 @@ def handles(workcell: Workcell) -> tuple[Handle, ...]:
 
 
 def moved(workcell: Workcell, handle: Handle, pose: Array) -> dict[str, Any]:
-    """Return the changes of the workcell file, by key path, that move a draggable part to another
-    pose (4, 4) in the world."""
+    """Return the changes of the workcell file that move a part of the cell.
+
+    Args:
+        handle: the part.
+        pose: (4, 4) its new pose in the world.
+
+    Returns:
+        Changed values by key path, as for `Cell.changed`.
+    """
     xyz = [round(value, 6) for value in pose[:3, 3].tolist()]
     rpy = [round(value, 6) for value in rpy_from_rotation(pose[:3, :3]).tolist()]
     section = handle.key.partition(".")[0].partition("[")[0]
@@ -291,7 +308,8 @@ FRAME = 0.04
 
 
 class Workbench:
-    """A cell that is changed in a browser page, served to this machine alone.
+    """A page in the browser on which a cell is changed and its carry shown. It is served to this
+    machine only.
 
     One thread does all work. It always takes the latest request, so that dragging never makes
     requests queue.
@@ -307,7 +325,7 @@ class Workbench:
         Args:
             session: the session.
             port: port of the page; another free one is taken if it is in use.
-            seed: of the random numbers of searches.
+            seed: seed of the random numbers of searches.
 
         Raises:
             DisplayError: the package viser is not installed.
@@ -335,14 +353,22 @@ class Workbench:
         self._thread.start()
 
     def ask(self, changes: dict[str, Any]) -> None:
-        """Request the evaluation of changes by key; of several waiting values of a key only the
-        last counts."""
+        """Request an evaluation with changed values. Of several requests that wait, only the last
+        value of each key counts.
+
+        Args:
+            changes: new values by key path of the workcell file.
+        """
         with self._news:
             self._changes |= changes
             self._news.notify()
 
     def do(self, task: Callable[[], None]) -> None:
-        """Request a task; tasks run one after the other."""
+        """Request a task; all tasks run one after the other in one thread.
+
+        Args:
+            task: function without arguments.
+        """
         with self._news:
             self._tasks.append(task)
             self._news.notify()
@@ -410,7 +436,8 @@ class Workbench:
         )
 
     def _look(self) -> None:
-        """Place the camera in front and above such that the whole motion is visible."""
+        """Place the camera in front of the cell and above it, such that the whole motion is
+        visible."""
         carry = self.session.verdict.carry
         assert carry is not None, "a session begins with a carry"
         points = motion_points(self._geometry, carry.pose, carry.q)
@@ -423,7 +450,7 @@ class Workbench:
         field.on_update(lambda _: self.ask({key: field.value}))
 
     def _grasp(self, handle: Handle | None) -> None:
-        """Show the arrows for dragging at one part, or at none."""
+        """Show the arrows for dragging at one part of the cell; at none for None."""
         if self._gizmo is not None:
             self._gizmo.remove()
             self._gizmo = None
@@ -533,10 +560,10 @@ class Workbench:
 
 
 def live(cell: Cell, port: int = 8080, x: Array | None = None) -> Workbench:
-    """Open a cell in a browser of this machine, to be changed by hand.
+    """Open a page in the browser on which a cell is changed by hand.
 
     Args:
-        port: port to listen at; if the port is in use, a free port is taken.
+        port: port of the page; if it is in use, a free one is taken.
         x: (n_var,) decision vector of a carry of `cell.drivable()`; None for the hand-made carry.
 
     Raises:

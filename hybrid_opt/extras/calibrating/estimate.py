@@ -54,13 +54,13 @@ crosstalk count as determined."""
 
 @dataclass(frozen=True)
 class MeasuredHold:
-    """A box held still, in means over a short time.
+    """A box held still by both pads: measured values, averaged over a short time.
 
     Attributes:
         pads: (2, 4, 4) poses of the pads in the box frame.
         gravity: (3,) gravity in the box frame [m/s^2].
-        wrench: (2, 6) wrench on each arm about the arm's pad, along the pad's axes, without the
-            sensor's offset [N, N m].
+        wrench: (2, 6) force and moment on each arm, about the pad's centre along the pad's axes,
+            without the sensor's offset [N, N m].
         mass: weighed mass of the box [kg]; None if the box was not weighed.
     """
 
@@ -77,14 +77,16 @@ class MeasuredHold:
 
 @dataclass(frozen=True)
 class Load:
-    """Estimate from holds; standard deviations are infinite where the holds show nothing.
+    """Payload and crosstalk of the force sensors, estimated from holds. A standard deviation is
+    infinite if the holds do not determine the value.
 
     Attributes:
         mass: mass of the box [kg].
         centre: (3,) centre of mass in the box frame [m].
-        crosstalk: (2, 2) crosstalk of each arm's sensor along the pad's x and y [N/N].
-        deviations: (8,) standard deviations of mass, centre and crosstalk, in this order.
-        residual: root mean square of the residual force of Eq. (1) [N].
+        crosstalk: (2, 2) for each arm, force along the pad's x and y axes that the sensor shows per
+            newton of normal force.
+        deviations: (8,) standard deviations: mass [kg], centre (3) [m], crosstalk (4).
+        residual: root mean square of the force that the estimate leaves unexplained in Eq. (1) [N].
     """
 
     mass: float
@@ -100,17 +102,18 @@ class Load:
 
     @property
     def observable_centre(self) -> Array:
-        """True (3,) for each box axis along which the holds determine the centre of mass."""
+        """(3,) True for each box axis along which the holds determine the centre of mass."""
         return np.asarray(self.deviations[1:4] <= SEEN_CENTRE)
 
     @property
     def observable_crosstalk(self) -> Array:
-        """True (2, 2) for each number of crosstalk that the holds determine."""
+        """(2, 2) True for each entry of `crosstalk` that the holds determine."""
         return np.asarray(self.deviations[4:].reshape(2, 2) <= SEEN_CROSSTALK)
 
 
 def fit_load(holds: Sequence[MeasuredHold], moments: bool = True) -> Load:
-    """Estimate the load and the crosstalk that explain holds best.
+    """Estimate the payload's mass and centre of mass and the sensors' crosstalk from holds, by
+    least squares.
 
     Args:
         holds: at least one hold.
@@ -150,8 +153,11 @@ def fit_load(holds: Sequence[MeasuredHold], moments: bool = True) -> Load:
 
 
 def _balance(hold: MeasuredHold) -> tuple[Array, Array, Array]:
-    """Return Eqs. (1) and (2) of a hold as a linear system: matrix (6, unknowns), right side (6,),
-    and the covariance (6, 6) of the right side."""
+    """Return the balance of forces and moments of a hold, Eqs. (1) and (2), as a linear system.
+
+    Returns:
+        Matrix (6, unknowns), right side (6,), and covariance (6, 6) of the right side.
+    """
     matrix, value, noise = np.zeros((6, len(WIDTHS))), np.zeros(6), np.zeros((6, 6))
     matrix[:3, 0] = hold.gravity
     matrix[3:, 1:4] = -skew(hold.gravity)
@@ -168,7 +174,13 @@ def _balance(hold: MeasuredHold) -> tuple[Array, Array, Array]:
 
 
 def without_crosstalk(wrench: Array, crosstalk: Array) -> Array:
-    """Remove crosstalk of the normal force from readings (..., 2, 6) about the pads."""
+    """Subtract the crosstalk of the normal force from measured wrenches.
+
+    Args:
+        wrench: (..., 2, 6) force and moment on each arm about the pad's centre, along the pad's
+            axes [N, N m].
+        crosstalk: (2, 2) crosstalk along x and y of each arm, as in `Load`.
+    """
     found = np.array(wrench)
     found[..., :2] += wrench[..., 2:3] * crosstalk
     return found
@@ -197,17 +209,18 @@ alone reaches 1.04."""
 def delay(
     time: Array, first: Array, second: Array, most: float = 1.0, apart: float | None = None
 ) -> float | None:
-    """Estimate by how much the second signal lags behind the first [s]; negative if it is ahead.
+    """Estimate by how much a signal lags behind another [s]; negative if it is ahead.
 
     Args:
         time: (n,) times of the samples [s].
-        first, second: (n,) signals.
-        most: largest delay that is considered [s].
-        apart: a delay that is excluded [s], None for none.
+        first, second: (n,) the leading and the lagging signal, in any unit.
+        most: largest delay in either direction that is considered [s].
+        apart: delays up to this magnitude are compared with the result [s]; None to skip this test.
 
     Returns:
-        The delay with the largest correlation of both signals' rates; None if that correlation is
-        weak.
+        The delay with the largest correlation of both signals' rates; None if the signals are too
+        short, if that correlation is weak, or if it is hardly better than that of a delay up to
+        `apart`.
     """
     wide = round(SMOOTHED / GRID_STEP)
     if not 4 * wide < (time[-1] - time[0]) / GRID_STEP < LARGEST_GRID:
@@ -248,8 +261,8 @@ LARGEST_RATIO = 20.0
 
 
 class FrictionRatio:
-    """Function of a measured wrench: the friction coefficient of both pads with which the wrench
-    would just be held by evenly pressing pads.
+    """Function that computes the friction coefficient with which evenly pressing pads would just
+    hold measured wrenches.
 
     Args:
         workcell: cell with the contact patches.
@@ -265,11 +278,15 @@ class FrictionRatio:
             self._capacity.append(ca.Function("capacity", [grip, tangent], [carried]))
 
     def __call__(self, wrench: Array) -> float:
-        """Compute the friction coefficient that just holds the wrenches (2, 6) measured about both
-        pads, along the pads' axes, without offset and crosstalk [N, N m].
+        """Compute the friction coefficient, equal for both pads, that just holds measured wrenches.
+
+        Args:
+            wrench: (2, 6) force and moment on each arm about the pad's centre, along the pad's
+                axes, without offset and crosstalk [N, N m].
 
         Returns:
-            The coefficient; infinite if a pad does not press.
+            The coefficient; infinite if a pad does not press or none up to `LARGEST_RATIO`
+            suffices.
         """
         normal, tangent = -wrench[:, 2], wrench[:, :2]
         # Both moments act about the same line, their normals being opposite.

@@ -68,9 +68,9 @@ class EvidenceEntry:
     """One quantity that the runs determine.
 
     Attributes:
-        name: of the quantity, for messages.
-        found: the result as text.
-        key: key in the workcell file that gets the value, '' for none.
+        name: name of the quantity, for messages.
+        found: value of the quantity as text.
+        key: key in the workcell file that gets the value; '' for none.
     """
 
     name: str
@@ -86,10 +86,11 @@ class Evidence:
         workcell: the cell.
         runs: names of the recordings.
         entries: the determined quantities.
-        faults: faults of the runs.
+        faults: faults found in the recordings.
         asks: descriptions of further recordings that would determine the missing quantities.
-        tables: changed tables of the workcell file: new values by key, or one mapping per contact.
-        ranges: changed entries of the table `[uncertainty]`.
+        tables: changes of the workcell file by table: new values by key, or one such mapping per
+            contact.
+        ranges: changes of the table `[uncertainty]` by key.
     """
 
     workcell: Workcell
@@ -101,17 +102,28 @@ class Evidence:
     ranges: dict[str, Any] = field(default_factory=dict)
 
     def tell(self, name: str, found: str, key: str = "") -> None:
-        """Add a determined quantity with its result as text."""
+        """Add a determined quantity to `entries`.
+
+        Args:
+            name: name of the quantity, for messages.
+            found: value of the quantity as text.
+            key: key in the workcell file that gets the value; '' for none.
+        """
         self.entries.append(EvidenceEntry(name, found, key))
 
     def set_uncertainty(self, name: str, value: Any) -> None:
-        """Set an entry of the table `[uncertainty]`, rounded up to four decimals."""
+        """Set an entry of the table `[uncertainty]`, rounded up to four decimals.
+
+        Args:
+            name: key of the entry.
+            value: value of the entry.
+        """
         up = np.ceil(np.maximum(1e4 * np.asarray(value, dtype=float) - 1e-6, 0.0)) / 1e4
         self.ranges[name] = up.tolist()
 
     @property
     def changes(self) -> dict[str, Any]:
-        """All changed tables of the workcell file."""
+        """All changes of the workcell file, by table."""
         if not self.ranges:
             return self.tables
         # A stated table takes what it does not name for exact.
@@ -179,7 +191,13 @@ def _tell_offsets(run: Recording, offsets: Array, evidence: Evidence) -> None:
 
 
 def _pieces(run: Recording, places: Places) -> list[MeasuredHold]:
-    """Cut a run's holds into pieces that are still and complete."""
+    """Cut the labelled holds of a run into pieces in which the box is still and no sample is
+    missing.
+
+    Args:
+        run: the run.
+        places: pad poses and wrenches of the run.
+    """
     found = []
     for begin, end in run.labels.held:
         if any(a < end and b > begin for a, b in run.lost):
@@ -204,13 +222,13 @@ def _pieces(run: Recording, places: Places) -> list[MeasuredHold]:
 
 
 def _empty(run: Recording, pieces: list[MeasuredHold], evidence: Evidence) -> None:
-    """Add the largest force that the sensors show in a run without a box, and a fault if it is too
-    large.
+    """Determine the largest force that the sensors show in a run without a box; it is a fault if it
+    is too large.
 
     Args:
         run: the run.
         pieces: still pieces of the run.
-        evidence: gets the result.
+        evidence: the results, to which the force is added.
     """
     if not pieces:
         return
@@ -227,8 +245,12 @@ Sound = list[tuple[Recording, Places]]
 
 
 def _load(sound: Sound, evidence: Evidence) -> Load | None:
-    """Estimate mass, centre of mass and crosstalk as far as the runs determine them, and add the
-    results to the evidence. None if there are no holds, or the holds have faults."""
+    """Determine mass, centre of mass and crosstalk as far as the runs allow. Return None if there
+    are no holds, or the holds have faults.
+
+    Args:
+        evidence: the results, to which the values are added.
+    """
     holds, moments = [], True
     for run, places in sound:
         found = _pieces(run, places)
@@ -294,8 +316,13 @@ def _load(sound: Sound, evidence: Evidence) -> Load | None:
 
 
 def _friction(sound: Sound, load: Load | None, evidence: Evidence) -> None:
-    """Bracket the friction coefficient between the greatest ratio that held and the least that
-    slipped, and add both to the evidence."""
+    """Bracket the friction coefficient between the greatest ratio of forces that held and the least
+    that slipped.
+
+    Args:
+        load: the estimated payload, None if unknown.
+        evidence: the results, to which both bounds are added.
+    """
     if (
         load is None
         or not load.observable_crosstalk.all()
@@ -340,8 +367,12 @@ def _friction(sound: Sound, load: Load | None, evidence: Evidence) -> None:
 
 
 def _tracking(sound: Sound, evidence: Evidence) -> None:
-    """Add to the evidence quantiles of the measured over the commanded force, and the delay of the
-    force."""
+    """Determine how closely the measured normal force follows the commanded one: quantiles of their
+    ratio, and the delay.
+
+    Args:
+        evidence: the results, to which the values are added.
+    """
     worst: list[float] = []
     for i in range(2):
         shares, lags = [], []
@@ -369,8 +400,11 @@ def _tracking(sound: Sound, evidence: Evidence) -> None:
 
 
 def _drift(sound: Sound, evidence: Evidence) -> None:
-    """Add to the evidence the relative motion of the pads during holds, and the delay between the
-    arms."""
+    """Determine the relative motion of the pads during holds, and the delay between both arms.
+
+    Args:
+        evidence: the results, to which the values are added.
+    """
     beside: list[Array] = []
     turned: list[Array] = []
     delays = []

@@ -149,7 +149,11 @@ def _frame_faults(run: Recording, places: Places) -> list[Fault]:
 
 
 def _held(run: Recording) -> Array:
-    """Return a mask (n,) that is True for samples within a labelled hold."""
+    """Find the samples of a run within a labelled hold.
+
+    Returns:
+        (n,) True for these samples.
+    """
     found = np.zeros(len(run.time), dtype=bool)
     for span in run.labels.held:
         found |= run.within(*span)
@@ -171,8 +175,14 @@ def _unit_faults(workcell: Workcell, run: Recording, places: Places) -> list[Fau
 
 
 def _force_units(run: Recording, places: Places, held: Array) -> list[str]:
-    """Return texts about forces that seem to be in another unit: compared with the commanded
-    forces, and with those of the other arm."""
+    """Return texts about forces that seem to be in another unit, compared with the commanded forces
+    or with the forces of the other arm.
+
+    Args:
+        run: the run.
+        places: pad poses and wrenches of the run.
+        held: (n,) True for samples within a labelled hold.
+    """
     force = np.median(np.linalg.norm(places.wrench[held, :, :3], axis=2), axis=0)
     commands = np.isfinite(run.commanded).any(axis=0)
     asked = np.nanmedian(np.where(commands, run.commanded[held], 0.0), axis=0)
@@ -193,8 +203,14 @@ def _force_units(run: Recording, places: Places, held: Array) -> list[str]:
 
 
 def _moment_units(workcell: Workcell, places: Places, held: Array) -> list[str]:
-    """Return texts about moments that seem to be in another unit: moments about the pads compared
-    with the capacity of the patches."""
+    """Return texts about moments that seem to be in another unit, compared with what the contact
+    patches can transmit.
+
+    Args:
+        workcell: the cell.
+        places: pad poses and wrenches of the run.
+        held: (n,) True for samples within a labelled hold.
+    """
     normal = np.abs(np.median(places.normal[held], axis=0)).mean()
     for i, contact in enumerate(workcell.contacts):
         moment = float(np.median(np.linalg.norm(places.wrench[held, i, 3:], axis=1)))
@@ -236,8 +252,12 @@ def _range_faults(run: Recording) -> list[Fault]:
 
 
 def _pad_faults(workcell: Workcell, run: Recording, places: Places) -> list[Fault]:
-    """Return faults of pads that are not where they should hold the box, and of a squeeze that
-    vanishes during a hold."""
+    """Return faults of pads that are not at their places on the box during holds, and of normal
+    forces that vanish.
+
+    Args:
+        places: pad poses and wrenches of the run.
+    """
     found = []
     nominal = inverse(workcell.contacts[0].T_box_pad) @ workcell.contacts[1].T_box_pad
     room = sum(contact.patch_radius for contact in workcell.contacts)
@@ -273,8 +293,14 @@ def _pad_faults(workcell: Workcell, run: Recording, places: Places) -> list[Faul
 
 
 def vanished(normal: Array) -> Array:
-    """Return a mask (n,) that is True where the lesser of both normal forces (n, 2) vanishes during
-    a hold."""
+    """Find the samples of a hold at which the smaller of both normal forces nearly vanishes.
+
+    Args:
+        normal: (n, 2) normal force of each arm [N].
+
+    Returns:
+        (n,) True for these samples.
+    """
     squeeze = normal.min(axis=1)
     usual = np.quantile(squeeze, 0.75) if len(squeeze) else 0.0
     return np.asarray((squeeze < VANISHED * usual) & (usual > 0.0))
@@ -294,7 +320,8 @@ def _clock_faults(run: Recording, places: Places) -> list[Fault]:
 
 
 def load_faults(holds: list[MeasuredHold], load: Load, moments: bool) -> list[Fault]:
-    """Return faults in the balance of all holds: wrong units, swapped arms, or an unknown cause.
+    """Return the faults that the balance of forces in all holds shows: wrong units, swapped arms,
+    or an unknown cause.
 
     Args:
         holds: the still pieces.

@@ -47,7 +47,7 @@ Spans = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class Labels:
-    """Labels of a run in its side file, times on its clock [s].
+    """Labels of a recorded run in its side file. All times are on the clock of the recording.
 
     Attributes:
         mass: weighed mass of the box [kg]; None if the box was not weighed.
@@ -66,16 +66,16 @@ class Labels:
 
 @dataclass(frozen=True)
 class Recording:
-    """A run as it was recorded.
+    """Recorded run of both arms, at n common times.
 
     Attributes:
         name: name of the file.
         time: (n,) ascending times [s].
         steps: (2,) usual time step of each arm's recording [s].
         joints: joint positions (n, joints) of each arm [rad or m].
-        wrench: (n, 2, 6) force and moment that act on each arm, in `frame` [N, N m]; moments are
-            not finite where none were recorded.
-        commanded: (n, 2) normal force [N]; not finite where none was recorded.
+        wrench: (n, 2, 6) force and moment on each arm, in the frame `frame` [N, N m]; moments that
+            were not recorded are not finite.
+        commanded: (n, 2) commanded normal force of each arm [N]; not finite if not recorded.
         lost: intervals, far longer than the usual step, without new samples of an arm [s].
         frame: frame of the wrenches, one of `FRAMES`.
         largest: (2,) largest measurable force and moment [N, N m]; infinite if not stated.
@@ -95,7 +95,7 @@ class Recording:
 
     @property
     def has_moments(self) -> bool:
-        """True if moments were recorded, of both arms."""
+        """True if the moments of both arms were recorded."""
         return bool(np.isfinite(self.wrench[:, :, 3:]).all())
 
     def within(self, begin: float, end: float) -> Array:
@@ -103,8 +103,11 @@ class Recording:
         return np.asarray((self.time >= begin) & (self.time <= end))
 
     def around(self, instant: float) -> Array:
-        """Return a mask (n,) that is True for samples within `TARE_TIME` around an instant [s] at
-        which both arms stand still."""
+        """Find the samples at most `TARE_TIME` from an instant [s] at which both arms stand still.
+
+        Returns:
+            (n,) True for these samples.
+        """
         return self.within(instant - TARE_TIME / 2.0, instant + TARE_TIME / 2.0)
 
 
@@ -123,7 +126,7 @@ class ArmLog:
     Attributes:
         time: (m,) ascending times [s].
         joints: (m, joints) joint positions [rad or m].
-        wrench: (m, 6) wrench on the arm [N, N m].
+        wrench: (m, 6) force and moment on the arm [N, N m].
         commanded: (m,) commanded normal force [N].
         lost: intervals without new samples [s].
     """
@@ -136,8 +139,15 @@ class ArmLog:
 
 
 def lost_spans(time: Array, values: Array) -> Spans:
-    """Return the intervals [s] without samples, or in which all samples repeat the same values (m,
-    k)."""
+    """Find intervals without new samples: longer than usual without any, or with repeated values.
+
+    Args:
+        time: (m,) ascending times [s].
+        values: (m, k) recorded values.
+
+    Returns:
+        First and last time of each interval [s].
+    """
     steps = np.diff(time)
     long = np.flatnonzero(steps > max(GAP * float(np.median(steps)), LONG_GAP))
     same = (np.diff(values, axis=0) == 0.0).all(axis=1)
@@ -154,8 +164,8 @@ def together(
     frame: str,
     largest: Array | None = None,
 ) -> Recording:
-    """Merge the recordings of both arms into a run, the second arm's interpolated at the times of
-    the first arm's.
+    """Merge the recordings of both arms into one run, at the times of the first arm's samples. The
+    second arm's values are interpolated.
 
     Args:
         name: name of the recording.
@@ -327,9 +337,11 @@ class Places:
     """Poses of both pads in a run, and the wrenches on them.
 
     Attributes:
-        pads: (n, 2, 4, 4) poses of the pads in the world.
-        box: (n, 4, 4) poses of the box in the world: the middle of the poses by either pad.
-        wrench: (n, 2, 6) wrench on each arm about the arm's pad, along the pad's axes [N, N m].
+        pads: (n, 2, 4, 4) pose of each arm's pad in the world.
+        box: (n, 4, 4) pose of the box in the world: the middle between the poses that follow from
+            each pad.
+        wrench: (n, 2, 6) force and moment on each arm, about the pad's centre along the pad's axes
+            [N, N m].
     """
 
     pads: Array
@@ -338,12 +350,12 @@ class Places:
 
     @property
     def normal(self) -> Array:
-        """Normal forces (n, 2) of both arms [N]."""
+        """(n, 2) normal force of each arm [N]."""
         return -self.wrench[:, :, 2]
 
 
 def places_of(workcell: Workcell, run: Recording) -> Places:
-    """Convert a run to the frames of the pads."""
+    """Compute pad poses, box poses and wrenches about the pads from a recorded run."""
     pads, boxes, wrenches = [], [], []
     for i, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
         T_world_pad = pad_places(workcell, i, run.joints[i])
@@ -369,11 +381,16 @@ def places_of(workcell: Workcell, run: Recording) -> Places:
 
 
 def tared(run: Recording, places: Places) -> tuple[Places, Array]:
-    """Subtract the sensors' offsets from the wrenches of a run; the offset at a sample is the one
+    """Subtract the sensors' offsets from the wrenches of a run. The offset of a sample is the one
     measured at the last tare before it.
 
+    Args:
+        run: the run, whose labels state the tares.
+        places: poses and wrenches of the run.
+
     Returns:
-        The places with these wrenches, and the offsets (k, 2, 6) of the k recorded tares [N, N m].
+        The places with corrected wrenches; and the offset of each arm at each of the k recorded
+        tares (k, 2, 6) [N, N m].
     """
     instants = [instant for instant in sorted(run.labels.tare) if run.around(instant).any()]
     if not instants:
@@ -396,6 +413,9 @@ def is_bag(path: Path) -> bool:
 
 def read_topics(path: Path, topics: Collection[str]) -> dict[str, Messages]:
     """Read the messages of some topics of a ROS 2 recording, by topic.
+
+    Args:
+        topics: names of the topics.
 
     Raises:
         ResultsError: the recording cannot be read or lacks a topic, or rosbags is not installed.
@@ -428,8 +448,15 @@ def read_topics(path: Path, topics: Collection[str]) -> dict[str, Messages]:
 
 
 def joint_series(messages: Messages, names: list[str], path: Path) -> tuple[Array, Array]:
-    """Return times (n,) [s] and joint positions (n, joints) [rad or m] of the JointState messages
-    that contain all joints.
+    """Read joint positions from those JointState messages that contain all given joints.
+
+    Args:
+        messages: the messages with their times.
+        names: names of the joints, in the order of the result.
+        path: path of the recording, for messages of errors.
+
+    Returns:
+        Times (n,) [s] and joint positions (n, joints) [rad, or m for sliding joints].
 
     Raises:
         ResultsError: no message contains all joints.

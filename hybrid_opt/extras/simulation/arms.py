@@ -59,18 +59,18 @@ LOW, HIGH, BISECTIONS = 0.9, 2.0, 9
 
 @dataclass(frozen=True)
 class ArmOutcome(Outcome):
-    """Outcome of one simulation of a whole cell at n times. Slip is measured only while the box is
-    held.
+    """Outcome of one simulation of a whole cell, with measurements at n times. Slip is measured
+    only while the pads alone hold the box.
 
     Attributes:
         normal_force: (n, 2) measured normal force of each arm [N].
         normal_force_reference: (n, 2) commanded normal force of each arm [N].
-        q: (n, all joints) joint positions of both arms [rad].
-        tracking_error: (n, all joints) reference minus position [rad].
+        q: (n, all joints) joint positions of both arms side by side [rad, or m for sliding joints].
+        tracking_error: (n, all joints) reference minus simulated joint position [rad or m].
         torque_use: (all joints,) largest torque of each joint over its limit.
         box_position: (n, 3) position of the box frame in the world [m].
         box_rotation: (n, 3, 3) R_world_box.
-        misses: distance of the box from its goal at the end [m]; zero if there is no goal.
+        misses: final distance of the box centre from its goal [m]; zero if there is no goal.
         arrives: True if the box did not slip and ended at its goal.
     """
 
@@ -86,8 +86,8 @@ class ArmOutcome(Outcome):
 
 
 class PressedBox(HeldBox):
-    """A box with measured normal forces of the pads, and with contacts whose acceleration is
-    corrected."""
+    """A simulated box between pads: measures the pads' normal forces, and corrects MuJoCo's
+    contacts for the rotation of the pads."""
 
     def __init__(self, mujoco: ModuleType, model: Any, data: Any, workcell: Workcell) -> None:
         """Find the box, the pads and the contact points of each pad in a model.
@@ -111,16 +111,17 @@ class PressedBox(HeldBox):
 
     @property
     def normal_forces(self) -> Array:
-        """(2,) sum of the normal forces at the contact points of each pad in the last step [N]."""
+        """(2,) normal force of each robot's pads in the last step [N]."""
         pad, _, address, _ = self._contacts()
         return np.bincount(pad, self._data.efc_force[address], 2).astype(float)
 
     def mend_contacts(self) -> None:
-        """Correct the contacts of this step for all accelerations.
+        """Correct the contacts of this step for all accelerations. Call this method between the two
+        halves of a step.
 
-        MuJoCo takes J dv/dt as the acceleration of the box relative to a pad and neglects dJ/dt v,
-        some tenths of m/s^2 where arms swing. Without this term contacts creep by millimetres per
-        second and lift off. Call this method between the two halves of a step.
+        With contact Jacobian J and velocities v, MuJoCo takes J dv/dt as the acceleration of the
+        box relative to a pad and neglects dJ/dt v, some tenths of m/s^2 where arms swing. Without
+        this term contacts creep by millimetres per second and lift off.
 
         A step moves joints along arcs and the box along a line, which separates them by half of
         dJ/dt v dt^2. The contacts' damping is set to compensate for it.
@@ -134,7 +135,12 @@ class PressedBox(HeldBox):
         self._data.efc_aref[rows] -= sign * np.einsum("nij,nj->ni", axes, unseen)
 
     def _unseen(self, pad: int) -> Array:
-        """Compute dJ/dt v (3,) of a pad minus that of the box beneath it, world axes [m/s^2]."""
+        """Compute the acceleration dJ/dt v (3,) of a pad relative to the box that MuJoCo neglects,
+        world axes [m/s^2].
+
+        Args:
+            pad: index of the pad's robot.
+        """
         place, found = self._data.site_xpos[self.sites[pad]], []
         for body in (self._bodies[pad], self.box):
             self._mujoco.mj_jacDot(self._model, self._data, self._change, None, place, body)
@@ -143,9 +149,13 @@ class PressedBox(HeldBox):
         return less
 
     def _contacts(self) -> tuple[Indices, NDArray[np.bool_], Indices, Array]:
-        """Return the active contacts of the pads: index of the pad (n,); True if the pad is the
-        first body (n,); first of three rows among the constraints (n,); axes of the contact as rows
-        (n, 3, 3)."""
+        """Return the active contacts between pads and box.
+
+        Returns:
+            For n contacts: index (n,) of the pad's robot; True (n,) if the pad is the first of the
+            two bodies; index (n,) of the first of three constraint rows; axes (n, 3, 3) of the
+            contact as rows, world frame.
+        """
         contact = self._data.contact
         sides = self._pad_of_geom[contact.geom]
         pad = sides.max(axis=1)
@@ -175,7 +185,7 @@ class CellSimulation:
             workcell: the cell.
             settings: settings of the simulation; None for the defaults.
             disturbance: (3,) acceleration that the pads have to give the box in addition to the
-                motion's, world frame [m/s^2].
+                acceleration of the motion, world frame [m/s^2].
 
         Raises:
             SimulationError: MuJoCo is not installed, or torques are unknown.
@@ -202,16 +212,17 @@ class CellSimulation:
         """Simulate one job, up to its end or to a slip.
 
         Args:
-            reference: commands of the cell. Its workcell may differ from the simulated one in
+            reference: commands to both arms. Their cell may differ from the simulated one in
                 payload, friction and the positions of the pads.
-            control: kind of force control.
-            factor: multiple of the commanded normal forces.
+            control: 'impedance' for two position-controlled arms, 'leader' if only the arm that
+                does not lead controls its normal force, 'both' if both arms do.
+            factor: factor of the commanded normal forces.
         """
         return _ArmSimulation(self, reference, control, factor).outcome()
 
 
 class _ArmSimulation:
-    """The state of one simulation of a cell."""
+    """One simulation of a cell in progress."""
 
     def __init__(
         self,
@@ -255,7 +266,7 @@ class _ArmSimulation:
         ]
 
     def outcome(self) -> ArmOutcome:
-        """Run the simulation."""
+        """Run the simulation and return its outcome."""
         settings, pads, held = self._settings, self._pads, self._reference.job.held
         per_tick = round(settings.control_period / settings.time_step)
         every = max(1, round(LOOK_INTERVAL / settings.control_period))
@@ -305,7 +316,15 @@ class _ArmSimulation:
         )
 
     def _place(self, disturbance: Array) -> Array:
-        """Set arms and box to their first poses. Return the box's pose (7,) in MuJoCo's form."""
+        """Set arms and box to their first poses, and apply a disturbance to the box.
+
+        Args:
+            disturbance: (3,) acceleration that the pads have to give the box in addition, world
+                frame [m/s^2].
+
+        Returns:
+            (7,) pose of the box: position [m], and unit quaternion with the real part first.
+        """
         data, job = self._data, self._reference.job
         data.qpos[self._q], data.qvel[self._v] = self._ticks.q[0], self._ticks.q_rate[0]
         rotation = box_rotation(self._workcell.task.orientation, job.start)
@@ -329,7 +348,15 @@ class _ArmSimulation:
         self._pads.mend_contacts()
 
     def _torque(self, k: int, measured: Array) -> Array:
-        """Compute the torques (all joints,) [N m] at tick k, clipped to the joint limits."""
+        """Compute the joint torques of both arms, clipped to the torque limits.
+
+        Args:
+            k: index of the controllers' time step.
+            measured: (2,) measured normal force of each arm [N].
+
+        Returns:
+            (all joints,) torques, both arms side by side [N m, for sliding joints N].
+        """
         data, ticks = self._data, self._ticks
         error = ticks.q[k] - data.qpos[self._q]
         error_rate = ticks.q_rate[k] - data.qvel[self._v]
@@ -367,8 +394,8 @@ class _ArmSimulation:
 
 @dataclass(frozen=True, eq=False)
 class _Ticks:
-    """References at the controllers' ticks, as in `Reference`, with the pressing forces times the
-    factor."""
+    """References of both arms at the times of the controllers, with attributes as in `Reference`.
+    Normal forces, and their part of the torques, are multiplied by the factor of the simulation."""
 
     time: Array
     q: Array
@@ -408,11 +435,11 @@ class CarrySimulation:
     """Simulations of one carry.
 
     Attributes:
-        threshold: the least multiple of the planned forces that holds the box; None if there is
-            none between `LOW` and `HIGH`.
+        threshold: the least factor of the planned forces that holds the box; None if there is none
+            between `LOW` and `HIGH`.
         problem: reason why there is no threshold, else ''.
-        reference: commands of the cell in the simulation with the commanded forces.
-        squeeze: how the commanded forces came about.
+        reference: commands to both arms in the simulation `shown`.
+        squeeze: how the commanded forces were chosen.
         shown: outcome of the simulation with the commanded forces.
     """
 
@@ -426,14 +453,15 @@ class CarrySimulation:
 def simulate_carry(
     cell: Cell, carry: Carry, witness: CellSimulation, control: Control = "leader", leader: int = 0
 ) -> CarrySimulation:
-    """Find the threshold of a carry, and simulate it with the commanded forces.
+    """Find the least factor of a carry's planned forces that holds the box, and simulate the carry
+    with the commanded forces of a job.
 
     Args:
         cell: the cell.
         carry: carry from rest to rest.
         witness: simulation of the cell.
-        control: kind of force control.
-        leader: index of the arm that keeps its place.
+        control: kind of force control, as in `CellSimulation.simulate`.
+        leader: index of the arm that keeps its place; the other one is force-controlled.
 
     Raises:
         SettingsError: the carry does not start and end at rest.

@@ -53,14 +53,16 @@ RIM_POINTS = 8
 
 @dataclass(frozen=True)
 class Outcome:
-    """Outcome of one simulation at n times.
+    """Outcome of one simulation, with measurements at n times.
 
     Attributes:
-        factor: multiple of the pressing force.
-        holds: True if the box slipped by less than the slip in the settings.
-        time: (n,) times of the measurements, from the settled state on [s].
-        slip: (n, 2) largest displacement in the plane of each pad since the settled state [m].
-        turn: (n,) rotation of the box between its pads since the settled state [rad].
+        factor: factor of the pressing force.
+        holds: True if the box slipped by less than the `slip` of the settings.
+        time: (n,) times of the measurements [s], the first when the pads are pressed and the box is
+            at rest.
+        slip: (n, 2) largest displacement of the box in the plane of each robot's pad since the
+            first time [m].
+        turn: (n,) rotation of the box between its pads since the first time [rad].
     """
 
     factor: float
@@ -75,8 +77,12 @@ class Outcome:
         return int(self.slip[-1].argmax())
 
     def begins(self, slip: float) -> float:
-        """Return the time [s] at which the slip first exceeds `BEGINS` times `slip` [m]; infinite
-        if it never does."""
+        """Return the time at which the largest slip first exceeds `BEGINS` times `slip` [s];
+        infinite if it never does.
+
+        Args:
+            slip: displacement that counts as slip [m].
+        """
         beyond = np.flatnonzero(self.slip.max(axis=1) > BEGINS * slip)
         return float(self.time[beyond[0]]) if len(beyond) else float("inf")
 
@@ -86,10 +92,10 @@ AnyOutcome = TypeVar("AnyOutcome", bound=Outcome)
 
 @dataclass(frozen=True)
 class Threshold(Generic[AnyOutcome]):
-    """The least multiple of a force that holds the box, between two simulations.
+    """The least factor of a force that holds the box, bracketed by two simulations.
 
     Attributes:
-        slips, holds: outcome of the simulation just below and just above it.
+        slips, holds: outcome of the simulation just below the threshold, and of the one just above.
     """
 
     slips: AnyOutcome
@@ -97,7 +103,7 @@ class Threshold(Generic[AnyOutcome]):
 
     @property
     def factor(self) -> float:
-        """Mean of both multiples."""
+        """Mean of the factors of both simulations."""
         return (self.slips.factor + self.holds.factor) / 2.0
 
 
@@ -141,12 +147,12 @@ def mujoco_module() -> ModuleType:
 
 
 class HeldBox:
-    """Measurement of the box's pose between its pads in one simulation, at the beginning of the
+    """Measurement of the box's pose between its pads in one simulation, as at the beginning of the
     last step.
 
     Attributes:
-        sites: indices of the sites of both pads.
-        box: index of the body of the box.
+        sites: indices of MuJoCo's sites of both pads.
+        box: index of MuJoCo's body of the box.
     """
 
     def __init__(self, model: Any, data: Any, workcell: Workcell) -> None:
@@ -159,8 +165,12 @@ class HeldBox:
         self._settled: tuple[Array, Array] | None = None
 
     def look(self) -> tuple[Array, float]:
-        """Measure the displacement of the box at the patches' rims in the planes of the pads (2,)
-        [m], and its rotation between them [rad], since the first call."""
+        """Measure how far the box has moved between its pads since the first call.
+
+        Returns:
+            Slip (2,): largest displacement of the box in the plane of each pad, at the rim of its
+            patch [m]; and rotation of the box relative to the pads [rad].
+        """
         axes = self._data.site_xmat[self.sites].reshape(2, 3, 3)
         places = self._data.site_xpos[self.sites][:, None]
         position = self._data.xpos[self.box]
@@ -177,14 +187,15 @@ class HeldBox:
 
 @dataclass(frozen=True)
 class CarriageMotion:
-    """Motion of the carriage at n time steps.
+    """Motion of the carriage, the moving body that bears all pads of a simulation without arms, at
+    n time steps.
 
     Attributes:
-        time: (n,) from minus the settling time to the end of the carry [s].
-        pose: (n, 7) pose of the box frame: position in the world [m], unit quaternion with the real
-            part first.
-        velocity, acceleration: (n, 6) linear in the world frame, angular in the box frame [m, rad,
-            s].
+        time: (n,) times, from the negative settling time to the end of the carry [s].
+        pose: (n, 7) pose of the box frame: position in the world [m], then unit quaternion with the
+            real part first.
+        velocity, acceleration: (n, 6) linear along world axes [m/s, m/s^2], then angular along box
+            axes [rad/s, rad/s^2].
         rotation: (n, 3, 3) R_world_box.
     """
 
@@ -195,28 +206,38 @@ class CarriageMotion:
     rotation: Array
 
     def acceleration_at(self, place: Array) -> Array:
-        """Compute the acceleration (n, 3) of a point (3,) that is fixed in the box frame, along its
-        axes [m/s^2]."""
+        """Compute the acceleration (n, 3) along box axes of a point that moves with the box frame
+        [m/s^2].
+
+        Args:
+            place: (3,) the point in the box frame [m].
+        """
         spin, spin_rate = self.velocity[:, 3:], self.acceleration[:, 3:]
         linear = np.einsum("nji,nj->ni", self.rotation, self.acceleration[:, :3])
         turned: Array = linear + np.cross(spin_rate, place)
         return turned + np.cross(spin, np.cross(spin, place))
 
     def apply(self, data: Any, k: int) -> None:
-        """Set the carriage of a simulation, the first body, to the state of step k."""
+        """Set the carriage, the first body of a simulation, to its state at a time step.
+
+        Args:
+            data: MuJoCo's state, which is changed.
+            k: index of the time step.
+        """
         data.qpos[:7], data.qvel[:6] = self.pose[k], self.velocity[k]
         data.qfrc_applied[:6] = CARRIAGE_MASS * self.acceleration[k]
 
 
 @dataclass(frozen=True)
 class Drive:
-    """Motion of the carriage and pressing force at n time steps.
+    """Motion of the carriage, which bears both pads, and pressing force at n time steps.
 
     Attributes:
-        leader: index of the pad that keeps its place on the carriage.
+        leader: index of the pad that is fixed to the carriage; the other pad slides along its
+            normal.
         motion: motion of the carriage.
-        press: (n,) normal force of the other pad [N].
-        own: (n,) force along its normal that accelerates the sliding pad's mass [N].
+        press: (n,) normal force of the sliding pad [N].
+        own: (n,) force along the sliding pad's normal that accelerates the pad's own mass [N].
         tilt: (n, 2, 2) planned moments of both pads about the x and y axes of their frames [N m].
     """
 
@@ -228,9 +249,12 @@ class Drive:
 
 
 def planned_moments(cell: Cell, carry: Carry) -> Array:
-    """Compute the moments (n + 1, 2, 3) [N m] of each robot's planned wrench about the middle of
-    its pads, world frame: first at rest before the carry, then at the samples of the carry.
-    Friction and centre of mass are those of the carry."""
+    """Compute the moment of each robot's planned wrench about the middle of its pads, world frame:
+    at rest before the carry, then at its n samples.
+
+    Returns:
+        (n + 1, 2, 3) moments [N m].
+    """
     workcell = carry.workcell
     still = np.zeros_like(carry.rate[:1])
     known = replace(
@@ -257,16 +281,17 @@ def drive_of(
     leader: int = 0,
     moments: Array | None = None,
 ) -> Drive:
-    """Compute the motion and the pressing force of a carry from rest to rest, with the box at rest
-    before it.
+    """Compute the motion of the pads and the pressing force for the simulation of a carry. The box
+    is at rest for some time before it.
 
     Args:
         carry: the carry at n samples.
         settings: settings of the simulation.
         press: (n,) pressing force at the samples [N]; None for the planned normal force of the arm
             that does not lead.
-        leader: index of the arm that keeps its place.
-        moments: result of `planned_moments`, which turns driven pads; None for no moments.
+        leader: index of the arm whose pad keeps its place.
+        moments: moments from `planned_moments` that rotate the pads about their centres; None for
+            none.
 
     Raises:
         SettingsError: the carry does not start and end at rest, or `press` has another shape.
@@ -297,7 +322,8 @@ def drive_of(
 
 
 def carriage_motion(carry: Carry, settings: SimulationSettings) -> CarriageMotion:
-    """Compute the motion of a carry from rest to rest, with the box at rest before it.
+    """Compute the motion of the pads for the simulation of a carry. The box is at rest for some
+    time before it.
 
     Raises:
         SettingsError: the carry does not start and end at rest.
@@ -340,7 +366,7 @@ def refuse_motion_at_ends(carry: Carry) -> None:
 
 
 class BoxSimulation:
-    """Simulation of one workcell's box between its pads.
+    """Simulation of the box of one workcell between its pads, without arms.
 
     Attributes:
         workcell, settings: the cell, and settings of the simulation.
@@ -358,7 +384,7 @@ class BoxSimulation:
             workcell: the cell.
             settings: settings of the simulation; None for the defaults.
             disturbance: (3,) acceleration that the pads have to give the box in addition to the
-                motion's, world frame [m/s^2].
+                acceleration of the motion, world frame [m/s^2].
 
         Raises:
             SimulationError: MuJoCo is not installed.
@@ -372,8 +398,12 @@ class BoxSimulation:
         self._model = cache(self._compiled)
 
     def simulate(self, drive: Drive, factor: float = 1.0) -> Outcome:
-        """Simulate one carry with the pressing force times a factor, until its end or until the box
-        slips."""
+        """Simulate one carry until its end or until the box slips.
+
+        Args:
+            drive: motion of the pads and pressing force.
+            factor: factor of the pressing force.
+        """
         mujoco, model, settings = self._mujoco, self._model(drive.leader), self.settings
         data = mujoco.MjData(model)
         held = HeldBox(model, data, self.workcell)
@@ -412,9 +442,12 @@ class BoxSimulation:
 
 
 def workcell_of_case(workcell: Workcell, case: Array) -> Workcell:
-    """Return the workcell with the values of a case (18,), laid out by
-    `symbolic.contact.worst_cases.CASE_SIZES`. The disturbance and the errors of the arms are not
-    part of a workcell and left out."""
+    """Return the workcell with the payload, friction and pads of one case of its uncertainty. The
+    disturbance and the arms' errors in a case have no place in a workcell and are left out.
+
+    Args:
+        case: (18,) values in the order of `symbolic.contact.worst_cases.CASE_SIZES`.
+    """
     payload = workcell.payload
     mass, centre = float(case[4]), case[5:8]
     # The inertia is known about the nominal centre of mass: Steiner's theorem takes it to the true.

@@ -87,18 +87,19 @@ HAND_JOINTS = ("x", "y", "turn")
 
 @dataclass(frozen=True)
 class HandOutcome(Outcome):
-    """Outcome of one simulation of hands. The factor multiplies their holding forces.
+    """Outcome of one simulation of a payload in hands. Its `factor` multiplies the hands' holding
+    forces.
 
     Attributes:
-        lift: (n, 2) largest distance of the payload from the rim of any hand of each robot [m];
-            negative while all hands press.
+        lift: (n, 2) largest distance between the payload and the rim of a hand, over the hands of
+            each robot [m]; negative while all rims are pressed.
     """
 
     lift: Array
 
     @property
     def lifts(self) -> bool:
-        """True if a rim lifted at the end."""
+        """True if the payload was off the rim of a hand at the end."""
         return bool(self.lift[-1].max() > 0.0)
 
 
@@ -122,9 +123,10 @@ class HandSimulation:
             workcell: the cell.
             settings: settings of the simulation; None for `HAND_SETTINGS`.
             disturbance: (3,) acceleration that the hands have to give the payload in addition to
-                the motion's, world frame [m/s^2].
-            opposed: (3,) force of the second arm's hands on the payload against those of the
-                first, box frame [N]. The second arm is displaced until it acts.
+                the acceleration of the motion, world frame [m/s^2].
+            opposed: (3,) force of the second arm's hands on the payload with which the arms work
+                against each other, box frame [N]. The second arm is displaced such that this force
+                results.
 
         Raises:
             SimulationError: MuJoCo is not installed.
@@ -144,12 +146,13 @@ class HandSimulation:
     def simulate(
         self, motion: CarriageMotion, holding_force: ArrayLike, factor: float = 1.0
     ) -> HandOutcome:
-        """Simulate one carry until its end, a slip or a lifted rim.
+        """Simulate one carry until its end, until a hand slips or until the payload is off the rim
+        of a hand.
 
         Args:
-            motion: motion of the carriage.
-            holding_force: holding force of each hand, or (2,) of the hands of either robot [N].
-            factor: multiple of the holding force.
+            motion: motion of the carriage, which bears all hands.
+            holding_force: holding force of each hand, or (2,) that of each robot's hands [N].
+            factor: factor of the holding force.
         """
         mujoco, settings = self._mujoco, self.settings
         model = copy(self._model())
@@ -212,8 +215,16 @@ class HandSimulation:
 
 
 def own_forces(workcell: Workcell, forces: Array) -> Array:
-    """Return the forces (2,) of either arm's hands, from forces (2,) that are stated for the weaker
-    hands of both [N]."""
+    """Convert holding forces that are stated for the robot with the weaker hands to those of each
+    robot's own hands.
+
+    Args:
+        workcell: the cell.
+        forces: (2,) holding forces as if both robots had the weaker hands [N].
+
+    Returns:
+        (2,) holding force of each robot's hands [N].
+    """
     own = np.array([contact.holding_force for contact in workcell.contacts])
     return np.asarray(forces * own / own.min())
 
@@ -221,12 +232,12 @@ def own_forces(workcell: Workcell, forces: Array) -> Array:
 def hand_threshold(
     carry: Carry, settings: SimulationSettings = HAND_SETTINGS
 ) -> Threshold[HandOutcome]:
-    """Find the least multiple of a carry's planned forces with which no hand slips and no rim
-    lifts.
+    """Find the least factor of a carry's planned forces with which no hand slips and the payload
+    stays on the rims of all hands.
 
     Raises:
-        SimulationError: MuJoCo is not installed, or no multiple between `LOW_FACTOR` and
-            `HIGH_FACTOR` separates both.
+        SimulationError: MuJoCo is not installed, the payload slips or lifts at `HIGH_FACTOR`, or it
+            holds at `LOW_FACTOR`.
         SettingsError: the pads press the payload between them.
     """
     planned = own_forces(carry.workcell, carry.peak_normal_force)
@@ -239,7 +250,7 @@ class HeldInHands:
     """Measurement of the payload's pose in its hands in one simulation.
 
     Attributes:
-        each: indices of the bodies of the hands.
+        each: indices of the hands, those of the first robot first.
     """
 
     def __init__(self, model: Any, data: Any, workcell: Workcell) -> None:
@@ -281,8 +292,8 @@ class HeldInHands:
 
 
 def swing_frequency(workcell: Workcell, settings: SimulationSettings = HAND_SETTINGS) -> float:
-    """Compute the lowest frequency with which the payload swings on the layers of its hands while
-    the arms are at rest [Hz]."""
+    """Compute the lowest frequency at which the payload swings on the elastic layers of its hands
+    while the arms are at rest [Hz]."""
     payload, stiffness = workcell.payload, _stiffness(workcell.pads, settings.layer)
     # Velocities of the centre of mass from those of the box frame.
     to_centre = np.eye(6)
@@ -293,14 +304,28 @@ def swing_frequency(workcell: Workcell, settings: SimulationSettings = HAND_SETT
 
 
 def _stiffness(hands: Iterable[Contact], layer: float) -> Array:
-    """Compute the stiffness (6, 6) of hands on their layers about the box frame [N, m, rad]."""
+    """Compute the stiffness matrix (6, 6) of hands on their elastic layers about the box frame
+    [N/m, N, N m/rad].
+
+    Args:
+        hands: the hands.
+        layer: stiffness of the layers per area [N/m^3].
+    """
     maps = [(wrench_to_box(hand), layer * layer_stiffness(hand)) for hand in hands]
     return np.asarray(sum(A @ K @ A.T for A, K in maps))
 
 
 def _displacement(workcell: Workcell, layer: float, opposed: ArrayLike) -> Array:
-    """Compute the displacement (3,) of the second arm, which does not turn, by which its hands act
-    against those of the first with a force, box frame [N, m]."""
+    """Compute the displacement of the second arm, without rotation, that makes the arms work
+    against each other with a given force.
+
+    Args:
+        layer: stiffness of the hands' elastic layers per area [N/m^3].
+        opposed: (3,) the force on the payload, box frame [N].
+
+    Returns:
+        (3,) displacement in the box frame [m].
+    """
     hands = list(zip(workcell.pads, workcell.pad_robots, strict=True))
     softness = sum(
         np.linalg.inv(_stiffness([hand for hand, robot in hands if robot == i], layer))
@@ -310,12 +335,15 @@ def _displacement(workcell: Workcell, layer: float, opposed: ArrayLike) -> Array
 
 
 def lip_points(hand: Contact, points: int) -> Array:
-    """Compute the points (n, 2) of a hand that press on the payload [m]. Their mean squares equal
-    those of the patch.
+    """Compute points of a hand that press on the payload, in the plane of its patch, whose mean
+    squared coordinates equal those of the patch.
 
     Args:
         hand: the hand.
         points: approximate number of points of a patch; the lip of a cup has a third of them.
+
+    Returns:
+        (n, 2) points [m].
     """
     if hand.half_sides is None:
         angle = 2.0 * np.pi * np.arange(points // RINGS) / (points // RINGS)
@@ -346,7 +374,17 @@ def _along(hand: Contact, settings: SimulationSettings) -> tuple[float, float]:
 
 
 def _own(hand: Contact, settings: SimulationSettings, motion: CarriageMotion) -> Array:
-    """Compute the forces (n, 3) along its joints that accelerate a hand itself [N, N m]."""
+    """Compute the forces that accelerate a hand's own inertia, along its three joints: both axes of
+    the patch [N], and the rotation about the normal [N m].
+
+    Args:
+        hand: the hand.
+        settings: settings of the simulation.
+        motion: motion of the carriage at n time steps.
+
+    Returns:
+        (n, 3) forces.
+    """
     inertia = np.array(_along(hand, settings)) / HAND_FREQUENCY**2
     R = hand.T_box_pad[:3, :3]
     linear = motion.acceleration_at(hand.T_box_pad[:3, 3]) @ R[:, :2]
@@ -359,7 +397,8 @@ def _hand_text(hand: Contact, settings: SimulationSettings, k: int, borne: float
     """Return a hand as MJCF, a body of the carriage.
 
     Args:
-        borne: share of the payload's mass that the hand bears [kg].
+        k: index of the hand, for names.
+        borne: part of the payload's mass that the hand bears [kg].
     """
     shear, torsion = _along(hand, settings)
     points = lip_points(hand, settings.points)

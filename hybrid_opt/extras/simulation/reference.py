@@ -44,11 +44,12 @@ TOUCHES = 5.0
 
 @dataclass(frozen=True, eq=False)
 class JointMotion:
-    """Joints of both arms, stacked, at n times that do not decrease.
+    """Motion of the joints of both arms side by side, at n times that do not decrease.
 
     Attributes:
-        time: (n,) [s].
-        q, q_rate, q_second: (n, all joints) positions and their time derivatives [rad, s].
+        time: (n,) times [s].
+        q, q_rate, q_second: (n, all joints) joint positions and their first and second time
+            derivatives [rad or m, and s].
     """
 
     time: Array
@@ -64,8 +65,8 @@ class BoxJob:
     Attributes:
         start: (6,) first pose of the box [m, rad].
         goal: (3,) desired final position of the box centre [m]; None if not checked.
-        held: interval in which only the pads hold the box and slip is measured [s].
-        stands: time until which an unmodelled support holds the box [s].
+        held: first and last time at which only the pads hold the box and slip is measured [s].
+        stands: time until which the box is kept in its first pose, in place of a support [s].
     """
 
     start: Array
@@ -76,16 +77,19 @@ class BoxJob:
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """References of a whole job at n times.
+    """Commands to both arms for a whole job, at n times.
 
     Attributes:
         workcell: the cell for which the job was planned.
         motion: motion of the joints.
-        normal_force: (n, 2) commanded normal force of each pad; zero while it need not touch [N].
-        effort: (n, all joints) joint torques to feed forward, pressing included [N m].
-        press_torque: (n, all joints) torques of each arm's joints per newton of normal force.
+        normal_force: (n, 2) commanded normal force of each arm [N]; zero while its pads need not
+            touch.
+        effort: (n, all joints) feedforward joint torques, those of the normal forces included [N m,
+            for sliding joints N].
+        press_torque: (n, all joints) joint torques per newton of the arm's normal force [m, for
+            sliding joints 1].
         job: start, goal and support of the box.
-        leader: index of the arm that keeps its place, if only the other arm controls its force.
+        leader: index of the arm that keeps its place if only the other arm controls its force.
     """
 
     workcell: Workcell
@@ -104,16 +108,16 @@ def job_reference(
     job: BoxJob,
     effort: Array | None = None,
 ) -> Reference:
-    """Build references from joint motion and normal forces.
+    """Build the commands to both arms from the motion of their joints and normal forces.
 
     Args:
         workcell: the cell.
         motion: motion of the joints at n times.
-        normal_force: (n, 2) commanded normal force of each pad [N].
+        normal_force: (n, 2) commanded normal force of each arm [N].
         job: start, goal and support of the box.
-        effort: (n, all joints) joint torques to feed forward: inverse dynamics and the contacts'
-            wrenches, pressing included [N m]. None for inverse dynamics and pressing alone; the
-            controllers' stiffness then has to carry the box.
+        effort: (n, all joints) feedforward joint torques: inverse dynamics and the wrenches of the
+            contacts, normal forces included [N m]. None for inverse dynamics and normal forces
+            only; the controllers' stiffness then has to carry the box.
 
     Raises:
         SettingsError: the shapes of the arrays do not fit, or times decrease.
@@ -141,16 +145,16 @@ def job_reference(
 def carry_reference(
     cell: Cell, carry: Carry, press: Array | None = None, leader: int = 0
 ) -> Reference:
-    """Build the reference of a carry from rest to rest, after some time at rest. It feeds forward
-    the forces of the planned wrenches.
+    """Build the commands to both arms for a carry that begins and ends at rest, after some time at
+    rest. The planned wrenches are fed forward as joint torques.
 
     Args:
         cell: the cell.
         carry: the carry at n samples.
         press: (n,) commanded normal force of the arm that does not lead [N]; None for its planned
             force.
-        leader: index of the leading arm. Its force is the planned one plus the additional force of
-            the other arm.
+        leader: index of the arm that keeps its place. Its normal force is the planned one plus what
+            `press` adds to that of the other arm.
 
     Raises:
         SettingsError: the carry does not start and end at rest, or `press` has another shape.
@@ -201,16 +205,18 @@ def carry_reference(
 def with_tracking_error(
     reference: Reference, amplitude: float, rng: np.random.Generator, opposed: float = 0.0
 ) -> Reference:
-    """Return references with a random sinusoidal error of each joint that starts at zero, and with
-    arms that push against each other.
+    """Return commands with a sinusoidal error of each joint position, and with torques by which the
+    arms push against each other.
 
-    Frequencies are drawn from 0.3 to 1.5 Hz. All other references stay the same.
+    The errors start at zero, with random frequencies from 0.3 to 1.5 Hz. Normal forces stay
+    unchanged.
 
     Args:
-        reference: the references.
-        amplitude: amplitude of each joint's error [rad].
-        rng: generator of frequencies and directions.
-        opposed: force of either arm along the first pad's face, in a random direction [N].
+        reference: the commands.
+        amplitude: largest error of each joint [rad].
+        rng: generator of frequencies, phases and the direction of the push.
+        opposed: force with which each arm pushes along the first pad's face, in a random direction
+            [N].
     """
     workcell, turned = reference.workcell, rng.uniform(0.0, 2.0 * np.pi)
     along = opposed * np.array([np.cos(turned), np.sin(turned), 0.0])
@@ -228,11 +234,17 @@ def with_tracking_error(
 
 
 def press_torque(workcell: Workcell, q: Array) -> Array:
-    """Compute the torques (n, all joints) of each arm's joints per newton of normal force, at
-    joints q (n, all joints).
+    """Compute the joint torques per newton of normal force of each arm.
 
-    Both arms press along the normals if these are opposite, else along the line between the middles
-    of their pads. So the additional forces cancel in the payload.
+    Both arms press along their normals if these are opposite, else along the line between the
+    middles of their pads. So the additional forces cancel in the payload.
+
+    Args:
+        workcell: the cell.
+        q: (n, all joints) joint positions of both arms side by side [rad or m].
+
+    Returns:
+        (n, all joints) torques per force [m, for sliding joints 1].
     """
     middles = [
         np.mean([pad.T_box_pad[:3, 3] for pad in (contact, *contact.further)], axis=0)
@@ -247,8 +259,17 @@ def press_torque(workcell: Workcell, q: Array) -> Array:
 
 
 def _force_torque(workcell: Workcell, q: Array, forces: tuple[Array, Array]) -> Array:
-    """Compute the joint torques (n, all joints) [N m] of forces of both robots on the box. Each
-    force, (3,) or (n, 3) in the box frame, acts in the middle of the robot's pads."""
+    """Compute the joint torques with which both robots exert forces on the box, each in the middle
+    of the robot's pads.
+
+    Args:
+        workcell: the cell.
+        q: (n, all joints) joint positions of both arms side by side [rad or m].
+        forces: force (3,) or (n, 3) of each robot on the box, box frame [N].
+
+    Returns:
+        (n, all joints) torques [N m, for sliding joints N].
+    """
     found = []
     parts = zip(workcell.robots, workcell.contacts, forces, joints_of(workcell, q), strict=True)
     for robot, contact, force, values in parts:
@@ -267,7 +288,8 @@ def _force_torque(workcell: Workcell, q: Array, forces: tuple[Array, Array]) -> 
 
 
 def inverse_dynamics(workcell: Workcell, motion: JointMotion) -> Array:
-    """Compute the torques (n, all joints) [N m] that move the arms without contacts."""
+    """Compute the joint torques (n, all joints) that move both arms without contacts, gravity
+    included [N m, for sliding joints N]."""
     found = []
     parts = [joints_of(workcell, values) for values in (motion.q, motion.q_rate, motion.q_second)]
     for robot, *rows in zip(workcell.robots, *parts, strict=True):
@@ -282,7 +304,8 @@ def _counts(workcell: Workcell) -> list[int]:
 
 
 def _with_rest(values: Array, keep: float) -> Array:
-    """Prepend two rows of rest: copies of the first row, times `keep`."""
+    """Prepend two rows of rest to an array (n, ...): copies of its first row, multiplied by
+    `keep`."""
     return np.concatenate([keep * values[:1], keep * values[:1], values])
 
 
@@ -294,10 +317,13 @@ class ArmState:
     """Measured state of one arm at one time.
 
     Attributes:
-        error, error_rate: (n_joints,) reference minus position, and its rate [rad, s].
-        jacobian: (6, n_joints) Jacobian of the pad, linear velocities first, world axes.
+        error, error_rate: (n_joints,) reference minus measured joint position [rad], and its time
+            derivative [rad/s].
+        jacobian: (6, n_joints) Jacobian of the pad: linear, then angular velocity along world axes
+            per joint velocity.
         normal: (3,) normal of the pad into the box, world axes.
-        force: measured normal force, or the mean of both arms' forces [N].
+        force: measured normal force [N]; if both arms control their force, the commanded force
+            minus the mean error of both arms' forces.
     """
 
     error: Array
@@ -308,10 +334,10 @@ class ArmState:
 
 
 class ArmController:
-    """Controller of one arm, with the integral of its force error.
+    """Controller of one arm's joint positions and, if wanted, of its normal force by an integral.
 
     Attributes:
-        is_force_controlled: whether the arm controls its force along the normal.
+        is_force_controlled: True if the arm controls its normal force.
     """
 
     def __init__(
@@ -322,15 +348,15 @@ class ArmController:
         is_force_controlled: bool,
         drift_stiffness: float,
     ) -> None:
-        """Start with a zero integral.
+        """Start with a zero integral of the force error.
 
         Args:
             settings: settings of the controllers.
-            gains: stiffness and damping of the joints [N m/rad, N m s/rad].
-            pad_stiffness: stiffness of the pads' layers [N/m]. Without force control, the arm aims
-                beyond the contact by the compression of the layers.
-            is_force_controlled: whether the arm controls its force along the normal.
-            drift_stiffness: remaining stiffness along the normal [N/m].
+            gains: stiffness and damping (n_joints,) of the joints [N m/rad, N m s/rad].
+            pad_stiffness: stiffness of all layers of the arm's pads along the normal [N/m]. An arm
+                without force control aims beyond the contact by the compression of the layers.
+            is_force_controlled: True if the arm controls its normal force.
+            drift_stiffness: stiffness along the normal that a force-controlled arm keeps [N/m].
         """
         self.is_force_controlled = is_force_controlled
         self._settings = settings
@@ -340,12 +366,12 @@ class ArmController:
         self._integral = 0.0
 
     def torque(self, state: ArmState, effort: Array, normal_force: float) -> Array:
-        """Compute the joint torques (n_joints,) [N m].
+        """Compute the joint torques (n_joints,) of one time step [N m].
 
         Args:
             state: measured state of the arm.
-            effort: (n_joints,) joint torques to feed forward [N m].
-            normal_force: reference of the normal force [N].
+            effort: (n_joints,) feedforward joint torques [N m].
+            normal_force: commanded normal force [N].
         """
         pressed, moved = 0.0, -normal_force / self._pad_stiffness
         along = state.normal @ state.jacobian[:3]
@@ -365,18 +391,22 @@ class ArmController:
 
 
 def pressed_reference(cell: Cell, carry: Carry, leader: int = 0) -> tuple[Reference, Squeeze]:
-    """Build the reference of a carry with the commanded forces of a job, and return it with how the
-    forces came about.
+    """Build the commands to both arms for a carry with the commanded normal forces of a job. Return
+    them, and how these forces were chosen.
 
-    The forces are robust if the workcell states its uncertainty. They are smooth, so controllers
-    can follow them, and never below the needed forces.
+    The forces hold the box in every case of the uncertainty, if the workcell states one. They are
+    smooth, so controllers can follow them, and never below the required forces.
+
+    Args:
+        leader: index of the arm that keeps its place; the other one is force-controlled.
     """
     forces, squeeze = commanded_forces(cell.workcell, carry, SqueezeSettings(leader=leader))
     return carry_reference(cell, carry, forces[:, 1 - leader], leader), squeeze
 
 
 def driven_carry(cell: Cell, x: Array) -> Carry:
-    """Compute the carry of a decision vector x (n_var,) from rest to rest, timed as in a job.
+    """Compute the carry of a decision vector x (n_var,), timed as in a job from rest to rest
+    without jumps of acceleration.
 
     Raises:
         SimulationError: the path has no timing.

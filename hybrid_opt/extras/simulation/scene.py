@@ -94,9 +94,9 @@ class ContactSettings:
     Attributes:
         time_step: time step of the physics [s].
         points: approximate number of contact points of a patch.
-        layer: stiffness of the pads' elastic layer per area [N/m^3]; the usual one is rubber of
-            2 MPa, 5 mm thick.
-        slip: displacement in the plane of a pad that counts as slip [m].
+        layer: stiffness of the pads' elastic layer per area [N/m^3]; the default is that of rubber
+            of 2 MPa, 5 mm thick.
+        slip: displacement of the box in the plane of a pad from which on it counts as slipping [m].
     """
 
     time_step: float = 1e-3
@@ -121,12 +121,12 @@ class ContactSettings:
 
 @dataclass(frozen=True)
 class SimulationSettings(ContactSettings):
-    """Settings of the simulation of pads alone.
+    """Settings of the simulation of pads without arms.
 
     Attributes:
-        pads: 'even' for points all over the patches of pads that keep their planned orientation;
-            'driven' for pads as the allocation `paper` assumes them: points at the rim of a round
-            patch or at the corners of a rectangle, turned by the planned moments.
+        pads: 'even' for points all over the patches, on pads that keep their planned orientation;
+            'driven' for pads as the contact model `paper` assumes them, with points at the rim of a
+            round patch or the corners of a rectangle, and rotated by the planned moments.
         settle: time at rest before the carry begins [s].
     """
 
@@ -147,8 +147,8 @@ class ArmSettings(ContactSettings):
         control_period: period of the controllers, a multiple of the time step [s].
         arrival: largest distance from its goal at which the box may end [m].
         stiffness: stiffness of each joint over its largest torque [1/rad].
-        damping_ratio: damping ratio of each joint with the inertia that it moves at the start.
-        armature: inertia of a motor at the output of its gear, over the joint's largest torque [kg
+        damping_ratio: damping ratio of each joint, for the inertia about the joint at the start.
+        armature: inertia of each motor, as seen at the joint, over the joint's largest torque [kg
             m^2 / (N m)]. Descriptions of robots do not state it.
         force_gain: gain of the integral force control [1/s].
         drift_stiffness: stiffness of each arm along the normal if both are force controlled [N/m].
@@ -180,14 +180,15 @@ class ArmSettings(ContactSettings):
 def scene_text(
     workcell: Workcell, settings: SimulationSettings, leader: int, disturbance: ArrayLike
 ) -> str:
-    """Return the MJCF document of a box between driven pads, for `compiled`.
+    """Return the MJCF document of a box between two pads on a carriage, without arms, for
+    `compiled`.
 
     Args:
         leader: index of the pad that is fixed to the carriage.
         workcell: the cell.
         settings: settings of the simulation.
         disturbance: (3,) acceleration that the pads have to give the box in addition to the
-            motion's, world frame [m/s^2]. It acts like a change of gravity.
+            acceleration of the motion, world frame [m/s^2]. It acts like a change of gravity.
     """
     pads = "\n".join(_pad_text(workcell, settings, i, slides=i != leader) for i in (0, 1))
     return carriage_text(workcell, settings, disturbance, pads)
@@ -200,7 +201,17 @@ def carriage_text(
     bodies: str,
     actuators: str = "",
 ) -> str:
-    """Return the MJCF document of a free payload between the bodies of a carriage."""
+    """Return the MJCF document of a free payload and a carriage, a heavy body that bears pads or
+    hands.
+
+    Args:
+        workcell: the cell.
+        settings: settings of the contacts.
+        disturbance: (3,) acceleration that the pads have to give the payload in addition to the
+            acceleration of the motion, world frame [m/s^2].
+        bodies: MJCF of the bodies on the carriage.
+        actuators: MJCF of the actuators.
+    """
     payload, touched = workcell.payload, 'contype="0" conaffinity="1"'
     if presses_on_box(workcell):
         faces = f'<geom type="box" size="{mjcf_text(payload.size / 2.0)}" {touched}/>'
@@ -224,16 +235,12 @@ def carriage_text(
 
 
 def compiled(mujoco: ModuleType, text: str, damping: float = LAYER_DAMPING) -> tuple[Any, str]:
-    """Compile the simulator's model of an MJCF document. Return the model, and the document as
-    MuJoCo reads it.
-
-    The pads' points state their stiffness [N/m] as negative `solref`. MuJoCo needs it multiplied by
-    a regularisation, which follows from the masses of the compiled model.
+    """Compile an MJCF document. Return MuJoCo's model, and the document as MuJoCo reads it.
 
     Args:
         mujoco: the simulator's module.
         text: the document.
-        damping: damping ratio of the points' layers.
+        damping: damping ratio of the elastic layers at the pads' contact points.
     """
     scene = mujoco.MjSpec.from_string(text)
     model = scene.compile()
@@ -266,7 +273,9 @@ def solver_options(settings: ContactSettings, gravity: Array, heaviest: float = 
     creep.
 
     Args:
-        heaviest: mass of a body much heavier than the box, if any [kg].
+        settings: settings of the contacts.
+        gravity: (3,) gravity in the world [m/s^2].
+        heaviest: mass of the heaviest body, if it is much heavier than the box [kg].
     """
     return f"""<option timestep="{settings.time_step!r}" gravity="{mjcf_text(gravity)}"
     cone="elliptic" impratio="{CREEP!r}" integrator="implicitfast" solver="Newton"
@@ -276,11 +285,13 @@ def solver_options(settings: ContactSettings, gravity: Array, heaviest: float = 
 def contact_points(
     contact: Contact, settings: ContactSettings, T_body_pad: Array, pads: Pads = "even"
 ) -> str:
-    """Return spheres at the contact points of a robot's patches, as geoms of the body with its
-    pads. The spheres touch the planes of the patches.
+    """Return spheres at the contact points of a robot's pads, as MJCF geoms of one body. The
+    spheres touch the planes of the patches.
 
     Args:
-        T_body_pad: (4, 4) first pad in the frame of the body.
+        contact: contact of the robot.
+        T_body_pad: (4, 4) pose of the first pad in the frame of the body.
+        pads: kind of pads, as in `SimulationSettings`.
     """
     T_body_box = T_body_pad @ inverse(contact.T_box_pad)
     text = []
@@ -292,7 +303,14 @@ def contact_points(
 
 
 def point_geoms(pad: Contact, layer: float, points: Array, T_body_pad: Array) -> str:
-    """Return spheres at points (n, 2) of a pad, touching its plane, as geoms of a body."""
+    """Return spheres that touch the plane of a pad, as MJCF geoms of one body.
+
+    Args:
+        pad: the pad.
+        layer: stiffness of its elastic layer per area [N/m^3].
+        points: (n, 2) points in the plane of the pad [m].
+        T_body_pad: (4, 4) pose of the pad in the frame of the body.
+    """
     in_pad = np.column_stack([points, np.full(len(points), -POINT_RADIUS)])
     stiffness = layer * pad.area / len(points)
     return "\n".join(
@@ -315,6 +333,8 @@ def pressed_places(contact: Contact, pads: Pads, points: int) -> Array:
     rectangle. The corners can carry every load of the sides, with the largest lever for torsion.
 
     Args:
+        contact: the pad.
+        pads: kind of pads, as in `SimulationSettings`.
         points: approximate number of points.
     """
     if pads == "driven":
@@ -333,8 +353,8 @@ def pressed_places(contact: Contact, pads: Pads, points: int) -> Array:
 
 
 def tilt_centre(contact: Contact) -> Array:
-    """Compute the middle (3,) of a robot's pads [m], where a force is shared evenly, from the
-    origin and along the axes of the first pad."""
+    """Compute the middle of a robot's pads (3,) in the frame of its first pad [m]. All pads share a
+    normal force evenly that acts there."""
     places = np.mean([pad.T_box_pad[:3, 3] for pad in (contact, *contact.further)], axis=0)
     T = contact.T_box_pad
     return np.asarray(T[:3, :3].T @ (places - T[:3, 3]))
@@ -342,7 +362,12 @@ def tilt_centre(contact: Contact) -> Array:
 
 def rim(contact: Contact, points: int) -> Array:
     """Compute points (n, 2) on the rim of a patch in the plane of the pad [m]: evenly around a
-    round patch, or evenly along the sides of a rectangle, corners included."""
+    round patch, or evenly along the sides of a rectangle, corners included.
+
+    Args:
+        contact: the pad.
+        points: number of points.
+    """
     if contact.half_sides is None:
         angles = 2.0 * np.pi * np.arange(points) / points
         return contact.patch_radius * np.column_stack([np.cos(angles), np.sin(angles)])
@@ -365,13 +390,12 @@ def presses_on_box(workcell: Workcell) -> bool:
 
 
 def plates(workcell: Workcell, touched: str) -> str:
-    """Return a flat plate under each pad, as geoms of the box. The plates are the contact surface
-    of payloads that are not boxes.
-
-    The planner assumes flat patches; real pads adapt to the shape of the payload.
+    """Return a flat plate under each pad, as MJCF geoms of the box, to be the contact surface of a
+    payload that is not a box.
 
     Args:
-        touched: attributes that state which bodies may touch the plates.
+        workcell: the cell.
+        touched: MJCF attributes that state which bodies may touch the plates.
     """
     text = []
     for pad in workcell.pads:
@@ -383,7 +407,13 @@ def plates(workcell: Workcell, touched: str) -> str:
 
 
 def piece_geom(piece: Piece, touch: str, meshes: list[str]) -> str:
-    """Return a piece as a geom. The mesh of a hull is added to the assets `meshes`."""
+    """Return a convex solid as an MJCF geom.
+
+    Args:
+        piece: the solid.
+        touch: MJCF attributes that state which bodies it may touch.
+        meshes: list of MJCF assets, to which the mesh of a convex hull is added.
+    """
     shape = piece.shape
     match shape:
         case Box():
@@ -403,12 +433,21 @@ def piece_geom(piece: Piece, touch: str, meshes: list[str]) -> str:
 
 
 def tilt_names(robot: int) -> tuple[str, str]:
-    """Return the names of the joints about the x and y axes of a robot's pad."""
+    """Return the names of the joints that rotate a robot's pad about its x and its y axis.
+
+    Args:
+        robot: index of the robot.
+    """
     return f"tilt_x_{robot + 1}", f"tilt_y_{robot + 1}"
 
 
 def pad_site(robot: int, T_body_pad: Array) -> str:
-    """Return the site of a robot's first pad as MJCF."""
+    """Return the site of a robot's first pad as MJCF.
+
+    Args:
+        robot: index of the robot.
+        T_body_pad: (4, 4) pose of the pad in the frame of the body.
+    """
     return f'<site name="pad_{robot + 1}" {placed(T_body_pad)} size="0.005"/>'
 
 
@@ -431,7 +470,7 @@ def _pad_text(workcell: Workcell, settings: SimulationSettings, i: int, slides: 
 
 
 def placed(T: Array) -> str:
-    """Return a transform (4, 4) as attributes of MJCF."""
+    """Return a transform T (4, 4) as position and orientation attributes of MJCF."""
     turn = Rotation.from_matrix(T[:3, :3]).as_quat(scalar_first=True)
     return f'pos="{mjcf_text(T[:3, 3])}" quat="{mjcf_text(turn)}"'
 
