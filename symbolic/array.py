@@ -37,14 +37,14 @@ class Range:
         return math.isfinite(value) and self.low <= value <= self.high
 
     def allowed(self) -> str:
-        """Describe the range in words."""
+        """Return the range in words, for a message."""
         if self.low == -math.inf and self.high == math.inf:
             return "any that is finite"
         return f"{self.low:g} to {self.high:g} {self.unit}".rstrip()
 
     def suspicion(self, value: float) -> str:
-        """Return the name of a unit in which a value outside the range was probably written by
-        mistake, '' if there is none."""
+        """Return text for a message if a value outside the range was probably written in one of the
+        units `mistaken`: the unit, and the value converted to `unit`. Return '' if not."""
         for name, factor in self.mistaken:
             if math.isfinite(value) and value != 0 and self.contains(value * factor):
                 return (
@@ -59,7 +59,7 @@ class TextPattern:
     """Allowed form of a text.
 
     Attributes:
-        problem: function that describes the fault of a value, '' without one.
+        problem: function that returns what is wrong with a value, '' if nothing is.
     """
 
     problem: Callable[[Any], str]
@@ -67,7 +67,12 @@ class TextPattern:
 
 @dataclass(frozen=True)
 class Shape:
-    """Sizes of an array's axes, None for any, and the kind of its numbers."""
+    """Allowed shape of an array.
+
+    Attributes:
+        sizes: size of each axis; None for any size.
+        kind: type of the array's entries, for example float or int.
+    """
 
     sizes: tuple[int | None, ...]
     kind: type = float
@@ -75,12 +80,12 @@ class Shape:
 
 @dataclass(frozen=True)
 class BroadcastScalar:
-    """Marks an array that a single number may fill."""
+    """Annotation of an array field: a single number may stand for an array of equal entries."""
 
 
 @dataclass(frozen=True)
 class AllowMissing:
-    """Marks a number, or an array's numbers, that may be missing: not finite."""
+    """Annotation of a number or an array: NaN and infinity are allowed and mean a missing value."""
 
 
 Figure = Annotated[float, AllowMissing()]
@@ -99,8 +104,16 @@ Row = Annotated[Array, Shape((None,))]
 
 
 def interpolated(at: Array, along: Array, values: Array) -> Array:
-    """Interpolate linearly at positions `at` (m,) between values (n, ...) that are known at
-    ascending positions `along` (n,). Return (m, ...)."""
+    """Interpolate tabulated values linearly, entry by entry.
+
+    Args:
+        at: (m,) positions at which values are wanted.
+        along: (n,) ascending positions of the table.
+        values: (n, ...) values at `along`.
+
+    Returns:
+        (m, ...) values at `at`; outside the table those at its nearest end.
+    """
     found = np.empty((len(at), *values.shape[1:]))
     for column in np.ndindex(values.shape[1:]):
         every = (slice(None), *column)
@@ -109,7 +122,7 @@ def interpolated(at: Array, along: Array, values: Array) -> Array:
 
 
 def evenly(count: int, most: int) -> NDArray[np.intp]:
-    """Return the indices of at most `most` of `count` rows, evenly spread, the first and the last
+    """Return up to `most` of the indices 0 to `count` - 1, evenly spread, the first and the last
     included."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(np.intp)
 
@@ -122,12 +135,12 @@ def set_read_only(record: object) -> None:
 
 
 def require_allowed(settings: object, whose: str = "") -> None:
-    """Raise an error if a settings record holds a value that its annotations do not allow: a value
-    that is not one of a `Literal`, or a number outside a `Range`. None passes if the annotation
-    allows it.
+    """Raise an error if a field of a settings record has a value that its annotation does not
+    allow: a value other than those of a `Literal`, or a number outside a `Range`. None passes if
+    the annotation includes None.
 
     Args:
-        settings: the settings record.
+        settings: the settings record, a dataclass.
         whose: text at the front of the message that names the owner of the settings.
 
     Raises:

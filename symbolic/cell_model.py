@@ -28,12 +28,12 @@ from symbolic.robot.model import RobotModel, build_robot_model
 
 @dataclass(frozen=True, eq=False)
 class CellBodies:
-    """A cell's arms and bodies, independent of the start postures.
+    """Arms and collision bodies of a cell, without start postures.
 
     Attributes:
         workcell: description of the cell.
-        robots: the models of the two arms.
-        geometry: the collision bodies and the pairs to be checked.
+        robots: models of the two arms.
+        geometry: collision bodies, and the pairs of bodies whose distances are checked.
     """
 
     workcell: Workcell
@@ -42,26 +42,27 @@ class CellBodies:
 
     @cached_property
     def screen(self) -> Screen:
-        """Parameters of the formulas for distance bounds."""
+        """Parameters of the formulas for lower bounds of the bodies' distances."""
         return screen_of(self.geometry)
 
     @cached_property
     def screening(self) -> dict[str, ca.Function]:
-        """The compiled functions of distance bounds, by name;
-        `symbolic.geometry.clearance.screening_functions` describes them."""
+        """CasADi functions of the lower bounds of the bodies' distances, by name;
+        `symbolic.geometry.clearance.screening_functions` lists them."""
         placements = (self.robots[0].joint_placements, self.robots[1].joint_placements)
         return screening_functions(self.geometry, placements, screen=self.screen)
 
 
 @dataclass(frozen=True, eq=False)
 class CellModel(CellBodies):
-    """A workcell with its arms, bodies and start postures, from which all functions of the cell are
+    """Workcell with its arms, bodies and start postures, from which all functions of the cell are
     built.
 
     Attributes:
         branches: for each arm all inverse-kinematics branches at the start, the best first.
-        start: (n,) joint positions of each arm at the first waypoint [rad].
-        given: the parameter group of the start postures if these are symbols, else empty.
+        start: for each arm the joint positions (n,) at the first waypoint [rad, or m for a sliding
+            joint].
+        given: the start postures as a parameter group if they are symbols, else None.
     """
 
     branches: tuple[tuple[StartBranch, ...], tuple[StartBranch, ...]]
@@ -74,9 +75,9 @@ def build_cell_bodies(workcell: Workcell, known: CellBodies | None = None) -> Ce
     a fifth of the time of `build_cell_model`.
 
     Args:
-        workcell: the description of the cell.
+        workcell: description of the cell.
         known: arms and bodies of a cell that differs only in the path, or in how the pads hold the
-            box. Compiled functions are reused if the same pairs can collide.
+            box. Its functions are reused if both cells check the same pairs of bodies.
 
     Raises:
         RobotModelError: a URDF does not describe a usable arm.
@@ -153,8 +154,13 @@ def build_cell_model(
 
 
 def own_pairs(geometry: CellGeometry, arm: int) -> list[int]:
-    """Return the indices of the active pairs between a body of one arm and anything but the other
-    arm. Parts of the machine that no joint moves belong to neither arm."""
+    """Return the indices of the active pairs that contain a body of one arm and no body of the
+    other arm. Parts of the machine that no joint moves belong to neither arm.
+
+    Args:
+        geometry: the collision bodies and pairs.
+        arm: index of the arm.
+    """
     own, other = (f"robot {i + 1}" for i in (arm, 1 - arm))
     groups = [
         {geometry.bodies[body].group for body in (pair.first, pair.second)}
@@ -164,13 +170,15 @@ def own_pairs(geometry: CellGeometry, arm: int) -> list[int]:
 
 
 def own_clearance(geometry: CellGeometry, arm: int, bounds: Bounds) -> Clearance:
-    """Return a function of the least distance bound [m] between one arm and anything but the other
-    arm, over all samples of a motion.
+    """Return a function of the clearance of one arm from everything except the other arm.
+
+    The function takes the box poses (n, 6) and the arm's joint positions (n, joints) at n samples.
+    It returns the least lower bound of a distance over all samples [m], infinity without pairs.
 
     Args:
         geometry: the collision bodies and pairs.
         arm: index of the arm.
-        bounds: function of the distance bounds of all pairs.
+        bounds: function of the distance bounds of all active pairs.
     """
     rows = own_pairs(geometry, arm)
 

@@ -15,8 +15,8 @@ Expression: TypeAlias = ca.SX | ca.MX
 
 
 def reciprocal(x: ca.SX) -> ca.SX:
-    """Return an expression of 1 / x to multiply by. CasADi would otherwise turn x * (1 / y) into a
-    division, which costs ten times as much as a product."""
+    """Return the expression 2 / (x + x) for 1 / x, as a factor of products. CasADi would turn x *
+    (1 / y) into a division, which costs ten times as much as a product."""
     return 2.0 / (x + x)
 
 
@@ -26,41 +26,47 @@ def named_function(
     """Build a CasADi function with named inputs and outputs, in the order of the mappings.
 
     Args:
-        name: of the function.
+        name: name of the function.
         inputs: symbols by name.
         outputs: expressions by name.
-        cse: whether common subexpressions are computed once.
+        cse: True to compute common subexpressions once.
     """
     sides = [*inputs.values()], [*outputs.values()], [*inputs], [*outputs]
     return ca.Function(name, *sides, {"cse": cse})
 
 
 def number(value: Any) -> Any:
-    """Return a number or an array of a record as a CasADi expression. Symbols are returned
-    unchanged."""
+    """Return a number or an array as a CasADi matrix (DM). CasADi symbols and expressions are
+    returned unchanged."""
     return value if isinstance(value, ca.SX | ca.MX) else ca.DM(value)
 
 
 def sx_parameters(*records: Any) -> dict[str, ca.SX]:
-    """Return the symbolic parameters in records as vectors by the name of their group; empty for
-    records of plain numbers."""
+    """Return the symbolic parameters of records, one SX vector per parameter group, by name of the
+    group. Records of plain numbers have none."""
     groups = (group for record in records if (group := getattr(record, "given", None)) is not None)
     return {group.name: group.symbols for group in groups}
 
 
 def mx_parameters(*records: Any) -> dict[str, ca.MX]:
-    """Return new MX symbols for the parameter groups in records, by name. Functions of MX use them
-    as inputs and pass them on to functions of SX."""
+    """Return a new MX vector for each parameter group of records, by name of the group. An MX
+    function takes these vectors as inputs and passes them to SX functions."""
     return mx_symbols(sx_parameters(*records))
 
 
 def mx_symbols(given: Mapping[str, ca.SX]) -> dict[str, ca.MX]:
-    """Return new MX symbols of the same sizes for parameter groups, by name."""
+    """Return a new MX vector for each of the SX vectors `given`, of equal size and by the same
+    name."""
     return {name: ca.MX.sym(name, symbols.numel()) for name, symbols in given.items()}
 
 
 def select_parameters(handed: Mapping[str, ca.MX], *records: Any) -> dict[str, ca.MX]:
-    """Return those of the symbols `handed` whose parameter groups occur in the given records."""
+    """Return those entries of `handed` whose parameter groups occur in the records.
+
+    Args:
+        handed: MX vectors by name of the parameter group.
+        records: records with symbols as parameters, or of plain numbers.
+    """
     return {name: handed[name] for name in sx_parameters(*records)}
 
 
@@ -68,9 +74,9 @@ def as_mx(value: ca.SX, given: Mapping[str, ca.SX], handed: Mapping[str, ca.MX])
     """Convert an SX expression of parameters to an MX expression.
 
     Args:
-        value: the expression.
-        given: the SX parameters by group.
-        handed: the MX symbols by group, from `mx_parameters`.
+        value: SX expression; it depends only on the parameters `given`.
+        given: SX vectors of the parameters by group; empty if value is constant.
+        handed: MX vectors by group, from `mx_parameters`, that replace them.
     """
     if not given:
         return ca.MX(ca.evalf(value))
@@ -78,6 +84,11 @@ def as_mx(value: ca.SX, given: Mapping[str, ca.SX], handed: Mapping[str, ca.MX])
 
 
 def tile(given: Mapping[str, ca.MX], n: int) -> list[ca.MX]:
-    """Return the parameter groups repeated n times side by side, as the n calls of
-    `casadi.Function.map` need them."""
+    """Return each parameter vector (k,) repeated as n equal columns (k, n), as
+    `casadi.Function.map` takes inputs of n calls.
+
+    Args:
+        given: parameter vectors by group.
+        n: number of calls.
+    """
     return [ca.repmat(symbols, 1, n) for symbols in given.values()]

@@ -56,10 +56,10 @@ GROUPS = frozenset((TASK, HELD, START, BODIES, *ARM_GROUPS, *SQUEEZES))
 
 @dataclass(frozen=True)
 class Parameter:
-    """Stands for a parameter array in a topology: group, key and shape, without the values.
+    """Placeholder of a parameter array in a cell's topology: its name and shape, without values.
 
     Attributes:
-        group: name of the group.
+        group: name of the parameter group.
         key: key path in the workcell file, or a description.
         shape: shape of the array, () for a single number.
     """
@@ -71,7 +71,12 @@ class Parameter:
 
 @dataclass(frozen=True)
 class LazyParameter:
-    """A parameter array of known shape whose values are computed on first use."""
+    """Parameter array whose values are computed on first use.
+
+    Attributes:
+        shape: shape of the array.
+        find: function without arguments that returns the values.
+    """
 
     shape: tuple[int, ...]
     find: Callable[[], Array]
@@ -141,7 +146,9 @@ _Take = _Collector | _Symbols
 
 @dataclass(frozen=True)
 class WorkcellParameters:
-    """Parameters and topology of a cell, without its collision bodies.
+    """Division of a cell, without its collision bodies, into parameters and topology.
+
+    Parameters are values that compiled functions take as inputs; topology is everything else.
 
     Attributes:
         cell: description of the cell.
@@ -156,8 +163,8 @@ class WorkcellParameters:
 
     @property
     def workcell(self) -> NumberedWorkcell:
-        """The cell's topology: its description with a `Parameter` in the place of every
-        parameter."""
+        """Topology of the cell: its description, with a `Parameter` in the place of every
+        parameter's value."""
         return self._collected[1]
 
     @property
@@ -166,19 +173,20 @@ class WorkcellParameters:
 
     @property
     def layout(self) -> dict[str, tuple[Parameter, ...]]:
-        """Parameters of every group except the start postures, in the order of the group's
-        vector."""
+        """For each parameter group, except the start postures, its parameters in the order of the
+        group's vector."""
         return {name: tuple(each for each, _ in found) for name, found in self._entries.items()}
 
     @cached_property
     def sizes(self) -> dict[str, int]:
-        """Length of every group's vector, except that of the start postures."""
+        """For each parameter group, except the start postures, the number of entries of its
+        vector."""
         return {
             name: sum(prod(each.shape) for each in found) for name, found in self.layout.items()
         }
 
     def vector(self, name: str) -> Array:
-        """Return the values (n,) of a group's parameters.
+        """Return the values (n,) of all parameters of the group `name`, one after the other.
 
         Raises:
             SettingsError: the group describes a grasp whose pads cannot close it.
@@ -196,7 +204,7 @@ class WorkcellParameters:
 
     @property
     def digest(self) -> str:
-        """Digest of the topology without collision bodies."""
+        """Digest (SHA-256) of the topology without arms and collision bodies."""
         return self._without_arms
 
     @cached_property
@@ -204,7 +212,7 @@ class WorkcellParameters:
         return digest_of_parts((self.workcell,))
 
     def symbols(self) -> NumberedWorkcell:
-        """Return the cell's description with symbols in the place of all parameters."""
+        """Return the cell's description with CasADi symbols in the place of all parameters."""
         return _workcell(self._symbols(), self.cell)
 
     def _symbols(self, further: Mapping[str, int] = MappingProxyType({})) -> _Symbols:
@@ -213,10 +221,10 @@ class WorkcellParameters:
 
 @dataclass(frozen=True)
 class CellParameters(WorkcellParameters):
-    """Parameters and topology of a cell with its collision bodies.
+    """Division of a cell with its collision bodies into parameters and topology.
 
     Attributes:
-        bounds: parameters of the distance bounds of all pairs.
+        bounds: parameters of the formulas for lower bounds of all pairs' distances.
         models: models of both arms.
     """
 
@@ -230,7 +238,8 @@ class CellParameters(WorkcellParameters):
 
     @property
     def screen(self) -> Screen:
-        """The topology of the distance bounds: a `Parameter` in the place of every parameter."""
+        """Topology of the distance bounds, with a `Parameter` in the place of every parameter's
+        value."""
         return self._of_bodies[1]
 
     @property
@@ -239,7 +248,7 @@ class CellParameters(WorkcellParameters):
 
     @cached_property
     def digest(self) -> str:
-        """Digest of the topology of workcell and arms, without other collision bodies."""
+        """Digest (SHA-256) of the topology of workcell and arms, without collision bodies."""
         arms = tuple(
             (model.model.saveToString(), model.flange_id, model.redundant, model.pose_size)
             for model in self.models
@@ -248,14 +257,15 @@ class CellParameters(WorkcellParameters):
 
     @cached_property
     def bodies_digest(self) -> str:
-        """Digest of the topology of the whole cell, collision bodies included."""
+        """Digest (SHA-256) of the topology of the whole cell, collision bodies included."""
         return digest_of_parts((self.digest, self.screen))
 
     def symbolic(self, bodies: CellBodies) -> CellModel:
-        """Return the symbolic model whose functions take the parameters as inputs.
+        """Build the model of the cell with CasADi symbols in the place of all parameters. Functions
+        of this model take the parameters as inputs.
 
         Args:
-            bodies: arms and bodies of this cell, or of one with the same topology.
+            bodies: arms and bodies of this cell, or of a cell with the same topology.
         """
         joints = [model.n_joints for model in self.models]
         take = self._symbols({START: sum(joints)})

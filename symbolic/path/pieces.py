@@ -20,7 +20,8 @@ from symbolic.records.task import RedundantJoint, Task, Waypoint, extended_waypo
 
 
 def refined_task(task: Task) -> Task:
-    """Return the task with free waypoints added between the waypoints of its file.
+    """Return the task with `task.pieces` - 1 free waypoints added between each two waypoints of its
+    file.
 
     The bounds of the added waypoints admit every path that the bounds in the file admit.
     """
@@ -47,7 +48,7 @@ def refined_task(task: Task) -> Task:
 
 
 def coarse_task(task: Task) -> Task:
-    """Return the task with only the waypoints of its file."""
+    """Return the task without the waypoints that `refined_task` added, with `pieces` 1."""
     if task.pieces == 1:
         return task
     every = slice(None, None, task.pieces)
@@ -73,10 +74,11 @@ def _with_waypoints(
 
 
 def coarse_entries(task: Task) -> NDArray[np.intp]:
-    """Return the indices of the path variables that belong to waypoints of the file.
+    """Return the indices of those path variables of a refined task that belong to waypoints of the
+    file.
 
     Returns:
-        Integer array with one index per path variable of the coarse task.
+        (coarse n_path,) integers, in the order of the path variables.
     """
     return np.flatnonzero(task.free_entries[0] % task.pieces == 0)
 
@@ -84,14 +86,15 @@ def coarse_entries(task: Task) -> NDArray[np.intp]:
 def hierarchical_basis(task: Task) -> tuple[Array, Array]:
     """Compute a hierarchical basis of the path variables, from coarse to fine waypoints.
 
-    The grid of stated waypoints is refined in steps, by halves as long as that is possible. Each
-    waypoint belongs to the coarsest grid that contains the waypoint. A move of a waypoint also
-    moves all waypoints of finer grids: they stay on the spline through the waypoint's grid.
+    The grid of the file's waypoints is refined in steps, by halves as long as that is possible.
+    Each waypoint belongs to the coarsest grid that contains it. A move of a waypoint also moves the
+    waypoints of all finer grids, so that they stay on the spline through the waypoint's grid.
 
     Returns:
         (n_path, n_path) matrix whose column j is the change of all path variables for a unit move
         of variable j; and (n_path,) squared grid spacing of each variable, relative to the spacing
-        of the stated waypoints. Accelerations of equal moves are inversely proportional to it.
+        of the file's waypoints. Equal moves cause accelerations inversely proportional to the
+        squared spacing.
     """
     (rows, columns), m = task.free_entries, len(task.waypoints)
     by, square = np.zeros((task.n_path, task.n_path)), np.zeros(task.n_path)
@@ -116,7 +119,7 @@ def resample_decisions(x: Array, source: Task, target: Task) -> Array:
     """Convert decision vectors of one task to the waypoints of another task.
 
     The paths stay the same if the target has all waypoints of the source. Otherwise the new paths
-    pass through the common waypoints, and path variables are clipped to the bounds of the target.
+    pass through the common waypoints. Path variables are clipped to the bounds of the target.
 
     Args:
         x: (n, source.n_path or more) decision vectors; entries after the path variables are kept.

@@ -27,7 +27,12 @@ _SINE = [0.5 * (-0.25) ** n / factorial(2 * n + 1) for n in range(TERMS)]
 
 
 def rotation_matrix(orientation: Orientation, numbers: Expression) -> Expression:
-    """Compute R_world_box (3, 3) from the last three numbers (3,) of a pose [rad]."""
+    """Compute the rotation R_world_box (3, 3) of a box pose.
+
+    Args:
+        orientation: convention of the three numbers.
+        numbers: (3,) last three entries of the pose [rad].
+    """
     if orientation.is_vector:
         turn = _matrix_of(*_quaternion(numbers))
         return ca.mtimes(turn, ca.DM(orientation.reference))
@@ -35,8 +40,13 @@ def rotation_matrix(orientation: Orientation, numbers: Expression) -> Expression
 
 
 def angular_velocity(orientation: Orientation, numbers: Expression, rate: Expression) -> Expression:
-    """Compute the angular velocity (3,) in the world frame [rad/s] from the three numbers of the
-    orientation and their rate."""
+    """Compute the angular velocity (3,) of the box in the world frame [rad/s].
+
+    Args:
+        orientation: convention of the three numbers.
+        numbers: (3,) last three entries of the box pose [rad].
+        rate: (3,) first time derivative of `numbers` [rad/s].
+    """
     if orientation.is_vector:
         zero = type(rate).zeros(3)
         return _turned(*_quaternion(numbers), *_quaternion_rates(numbers, rate, zero)[0])
@@ -46,8 +56,13 @@ def angular_velocity(orientation: Orientation, numbers: Expression, rate: Expres
 def angular_acceleration(
     orientation: Orientation, numbers: Expression, rate: Expression, second: Expression
 ) -> Expression:
-    """Compute the angular acceleration (3,) in the world frame [rad/s^2] from the three numbers of
-    the orientation and their first and second rate."""
+    """Compute the angular acceleration (3,) of the box in the world frame [rad/s^2].
+
+    Args:
+        orientation: convention of the three numbers.
+        numbers: (3,) last three entries of the box pose [rad].
+        rate, second: (3,) first and second time derivative of `numbers` [rad/s, rad/s^2].
+    """
     if orientation.is_vector:
         return _turned(*_quaternion(numbers), *_quaternion_rates(numbers, rate, second)[1])
     return _rpy_acceleration(numbers, rate, second)
@@ -118,8 +133,12 @@ def _rpy_matrix(rpy: Expression) -> Expression:
 
 
 def rate_matrix(rpy: Expression) -> Expression:
-    """Compute the matrix E (3, 3) of roll, pitch, yaw with angular velocity = E(rpy) @ rpy_rate in
-    the world frame."""
+    """Compute the matrix E (3, 3) from the rates of roll, pitch, yaw to the angular velocity in the
+    world frame: omega = E(rpy) @ rpy_rate.
+
+    Args:
+        rpy: (3,) roll, pitch, yaw [rad].
+    """
     cp, sp = ca.cos(rpy[1]), ca.sin(rpy[1])
     cy, sy = ca.cos(rpy[2]), ca.sin(rpy[2])
     return ca.vertcat(

@@ -25,7 +25,8 @@ from symbolic.records import Task
 
 @dataclass(frozen=True)
 class PathBasis:
-    """Constant matrices from waypoints to samples: poses = position @ waypoints.
+    """Constant matrices of the spline from waypoints to n samples: a row per sample, a column per
+    waypoint. A product with waypoint poses (n_waypoints, 6) gives poses (n, 6).
 
     Attributes:
         parameter: (n,) path parameter u of every sample.
@@ -56,7 +57,8 @@ def path_basis(n_waypoints: int, parameter: Array) -> PathBasis:
 
 
 def path_position(n_waypoints: int, parameter: Array) -> Array:
-    """Compute the matrix (n, n_waypoints) from waypoints to path positions at n values of u.
+    """Compute the matrix (n, n_waypoints) that maps waypoints to points of the spline at n values
+    of u.
 
     Args:
         n_waypoints: number of waypoints, at least 2.
@@ -84,7 +86,7 @@ def _natural_splines(n_waypoints: int) -> tuple[Callable[[Array], Array], ...]:
 
 
 def sample_basis(task: Task) -> PathBasis:
-    """Compute the basis at the task's samples, uniform in u."""
+    """Compute the spline's basis matrices at the samples of a task, which are uniform in u."""
     return path_basis(len(task.waypoints), np.linspace(0.0, 1.0, task.samples))
 
 
@@ -102,12 +104,13 @@ def _fixed(task: Task, value: Any, x: Expression, handed: Handed) -> Expression:
 
 
 def waypoint_matrix(task: Task, x: Expression, handed: Handed = NONE) -> Expression:
-    """Compute all waypoints from the decision vector, with unwrapped angles (paper Eq. 17).
+    """Compute the box poses at all waypoints from the decision vector, with unwrapped angles (paper
+    Eq. 17).
 
     Args:
         task: task that states the fixed waypoints.
         x: (n_var,) decision vector; it starts with the poses of the free waypoints in path order.
-        handed: parameters of the task as inputs of a function of MX, if there are any.
+        handed: inputs (MX) that hold the task's parameters, by group; empty for plain numbers.
 
     Returns:
         (6, n_waypoints) box poses: positions [m], orientations [rad].
@@ -131,16 +134,17 @@ def waypoint_matrix(task: Task, x: Expression, handed: Handed = NONE) -> Express
 def extended_matrix(
     task: Task, x: Expression, waypoints: Expression, handed: Handed = NONE
 ) -> Expression:
-    """Compute the extended waypoints: box poses, and below them the redundant joints.
+    """Compute the box poses at all waypoints, with the positions of the redundant joints below
+    them.
 
     Args:
         task: task with m redundant joints.
         x: (n_var,) decision vector.
         waypoints: (6, n_waypoints) box poses from `waypoint_matrix`.
-        handed: parameters of the task as inputs of a function of MX, if there are any.
+        handed: inputs (MX) that hold the task's parameters, by group; empty for plain numbers.
 
     Returns:
-        (6 + m, n_waypoints) poses and redundant joint positions.
+        (6 + m, n_waypoints) box poses [m, rad] and redundant joint positions [rad or m].
     """
     if not task.redundant:
         return waypoints

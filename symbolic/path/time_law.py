@@ -36,13 +36,13 @@ from which they converge."""
 
 @dataclass(frozen=True)
 class TimedPath:
-    """A sampled box motion; one sample per column.
+    """Sampled box motion; one column per sample.
 
     Attributes:
-        time: (1, n) [s], starts at 0.
-        pose: (6, n) position [m] and orientation [rad] (`symbolic.records.poses`).
-        rate: (6, n) first time derivative of the pose.
-        second_rate: (6, n) second time derivative of the pose.
+        time: (1, n) times [s], from 0.
+        pose: (6, n) position [m] and orientation [rad] of the box (`symbolic.records.poses`).
+        rate: (6, n) first time derivative of the pose [m/s, rad/s].
+        second_rate: (6, n) second time derivative of the pose [m/s^2, rad/s^2].
     """
 
     time: ca.MX
@@ -58,15 +58,16 @@ def timed_path(
     rounding: ca.MX | None = None,
     handed: Handed = NONE,
 ) -> TimedPath:
-    """Compute the box motion at the samples of `basis` with the task's time law.
+    """Compute the box motion at the samples of `basis` by the task's time law, `constant` or
+    `ramped`.
 
     Args:
         task: task that states the time law and the reference speeds.
-        basis: spline basis at the samples.
+        basis: spline basis at the n samples.
         waypoints: (6, n_waypoints) box poses from `symbolic.path.spline.waypoint_matrix`.
         rounding: relative width that smooths the maximum of translation and rotation time in the
             `constant` law; None for the exact maximum.
-        handed: parameters of the task as inputs of a function of MX, if there are any.
+        handed: inputs (MX) that hold the task's parameters, by group; empty for plain numbers.
     """
     pose = ca.mtimes(waypoints, ca.DM(basis.position.T))
     if task.law.has_differences:
@@ -79,12 +80,15 @@ def timed_path(
 def driven_path(
     basis: PathBasis, waypoints: ca.MX, time: ca.MX, speed: ca.MX, acceleration: ca.MX
 ) -> TimedPath:
-    """Compute the box motion at the samples of `basis`, with times and path speeds from a solver.
+    """Compute the box motion at the samples of `basis`, with the timing that a solver found.
 
     Args:
-        basis: spline basis at the samples.
+        basis: spline basis at the n samples.
         waypoints: (6, n_waypoints) box poses from `symbolic.path.spline.waypoint_matrix`.
-        time, speed, acceleration: (1, n) times [s], u' [1/s] and u'' [1/s^2] of the samples.
+        time: (1, n) times of the samples [s].
+        speed: (1, n) path speeds u' at the samples [1/s].
+        acceleration: (1, n) second time derivatives u'' of the path parameter at the samples
+            [1/s^2].
     """
     pose, first, second = (
         ca.mtimes(waypoints, ca.DM(matrix.T))

@@ -23,11 +23,11 @@ from symbolic.records.task import RedundantJoint, Task, Waypoint
 
 @dataclass(frozen=True)
 class ParameterGroup:
-    """Parameters that functions take as one vector.
+    """Parameters that functions take as one input vector.
 
     Attributes:
         name: name of the input.
-        symbols: (n,) symbols of the parameters.
+        symbols: (n,) CasADi symbols of the parameters.
     """
 
     name: str
@@ -36,12 +36,12 @@ class ParameterGroup:
 
 @dataclass(frozen=True, kw_only=True)
 class NumberedRobot(Robot):
-    """An arm whose numbers are symbols.
+    """An arm with symbols as parameters.
 
     Attributes:
-        T_box_flange: (4, 4) flange in the box frame while the arm holds the box.
-        lever: (3,) from the flange to the contact point, box axes [m].
-        given: the arm's numbers as one group.
+        T_box_flange: (4, 4) flange frame in the box frame while the arm holds the box.
+        lever: (3,) vector from the flange to the nominal contact point, box axes [m].
+        given: the arm's parameters as one group.
     """
 
     T_box_flange: Any = None
@@ -65,9 +65,9 @@ class NumberedContact(Contact):
     """A contact with symbols as parameters.
 
     Attributes:
-        twist, spread: lengths of the patch (`symbolic.contact.soft_finger.SoftPatch`).
-        share: for a hand, its matrix of `symbolic.contact.elastic.layer_shares`.
-        opposed: for a hand, its row of `symbolic.contact.holding_hands.internal_force_needs`.
+        twist, spread: lengths of the patch (`symbolic.contact.soft_finger.SoftPatch`) [m].
+        share: for a hand, its matrix (6, 6) of `symbolic.contact.elastic.layer_shares`.
+        opposed: for a hand, its row (3,) of `symbolic.contact.holding_hands.internal_force_needs`.
         weaker: for a hand, the least holding force of all hands over its own.
     """
 
@@ -80,7 +80,11 @@ class NumberedContact(Contact):
 
 @dataclass(frozen=True)
 class NumberedWaypoint(Waypoint):
-    """A pose of the path. Only a fixed pose has parameters."""
+    """A pose of the path with symbols as parameters. Only a fixed pose has parameters.
+
+    Attributes:
+        fixed: True if the task fixes the pose.
+    """
 
     fixed: bool = False
 
@@ -95,15 +99,15 @@ class NumberedJoint(RedundantJoint):
     """A redundant joint with symbols as parameters.
 
     Attributes:
-        free: True for waypoints at which the joint is a variable; at the others `lower` is a
-            parameter.
+        free: for each waypoint True if the joint position is a decision variable there; at the
+            other waypoints `lower` is a parameter.
     """
 
     free: tuple[bool, ...] = ()
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """(n_waypoints,) True for waypoints at which the value is a decision variable."""
+        """(n_waypoints,) booleans, True where the joint position is a decision variable."""
         return np.array(self.free, dtype=np.bool_)
 
 
@@ -120,24 +124,26 @@ class NumberedTask(Task):
 
 @dataclass(frozen=True)
 class GraspNumbers:
-    """Constants that NumPy derives for grasps by pads with any normals. The states of all pads have
-    n entries; the balance has b rows.
+    """Constants of a grasp by k pads with any normals, derived with NumPy. The scaled states of all
+    pads have n = 4 k entries, of which b are dependent: they follow from the load and the others.
 
     Attributes:
-        left: (b,) indices of the dependent components among the n.
-        squeeze: (n,) initial internal squeeze.
+        left: (b,) indices of the dependent entries among the n.
+        squeeze: (n,) internal squeeze, as states of all pads.
         spread: (n, 6) matrix from a load to the least-norm states that balance it.
-        load_to_left, free_to_left: (b, 6) and (b, n - b) matrices from the load and from the free
-            components to the dependent components, in units of
-            `symbolic.contact.grasp.Grasp.units`.
-        to_robots: (6, 6 k) matrix from all pads' wrenches to the first robot's force and moment,
-            from `symbolic.contact.force_closure.robot_wrenches`.
-        shapes: lengths of each pad over its radius, on which its cone depends; () for a disc.
-        load_at_rest: (6,) direction of the load at rest at the start.
-        rest, rest_slopes: (n,) states on the central path under this load, and (n, 6) their
-            derivatives by the load.
-        reach: size of the patches within which the squeeze lies, over the cell's own size.
-        given: the constants that are symbols, as one group.
+        load_to_left: (b, 6) matrix from the load to the dependent entries, in newtons and newton
+            metres (`symbolic.contact.grasp.Grasp.units`).
+        free_to_left: (b, n - b) matrix from the other entries to the dependent ones, in these
+            units; its product is subtracted.
+        to_robots: (6, 6 k) matrix from the wrenches of all pads to each robot's force and moment
+            (`symbolic.contact.force_closure.robot_wrenches`).
+        shapes: for each pad its lengths over its radius, on which its cone depends; empty for a
+            disc.
+        load_at_rest: (6,) load of the payload at rest at the start, divided by its size.
+        rest: (n,) states on the central path under `load_at_rest`.
+        rest_slopes: (n, 6) derivatives of `rest` by the load.
+        reach: size of the patches within which `squeeze` lies, over the cell's own size.
+        given: the constants that are symbols, as one group; None without symbols.
     """
 
     left: tuple[int, ...]
@@ -156,13 +162,14 @@ class GraspNumbers:
 
 @dataclass(frozen=True)
 class NumberedWorkcell(Workcell):
-    """A cell with a fixed arrangement of pads and symbols as parameters.
+    """A cell with symbols as parameters and a known arrangement of its pads.
 
     Attributes:
         facing, opposite, beside: values of `has_facing_pads`, `has_opposite_pads` and
             `has_offset_pads`.
-        grasp: constants of a grasp by pads with any normals, else None.
-        squeezes: constants of its programs of commanded forces, for either robot; else None.
+        grasp: constants of the grasp if its pads have any normals, else None.
+        squeezes: constants of the two programs of commanded forces, entry i with robot i commanded;
+            empty if the grasp needs no such program.
     """
 
     facing: bool = False
@@ -183,5 +190,5 @@ class NumberedWorkcell(Workcell):
 
     @property
     def has_offset_pads(self) -> bool:
-        """True if the contacts are offset laterally."""
+        """True if the contacts are offset perpendicular to the normal of contact 1."""
         return self.beside
