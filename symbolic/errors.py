@@ -75,7 +75,7 @@ class SceneError(DualArmError):
 
 
 class BridgeError(DualArmError):
-    """The code that is compiled during installation is missing, or was built for other versions of
+    """A module that is compiled during installation is missing, or was built for other versions of
     the libraries."""
 
 
@@ -88,4 +88,4 @@ class SettingsError(DualArmError):
 
 
 class BundleError(DualArmError):
-    """A workcell's files cannot be collected into one value, or unpacked from it."""
+    """The files of a workcell cannot be packed into one value, or unpacked from such a value."""

@@ -11,10 +11,11 @@ REMEDY = "run `pip install -e .` in the project's folder to compile it for this 
 
 
 def require_same_minor(built: dict[str, str], installed: dict[str, str]) -> None:
-    """Check that versions agree in major and minor number.
+    """Check that the versions of libraries agree in major and minor number.
 
     Args:
-        built, installed: versions by library name.
+        built: version of each library with which the module was compiled, by name of the library.
+        installed: version of each library that is installed, by name of the library.
 
     Raises:
         BridgeError: versions differ; the message names every such library.
@@ -31,11 +32,11 @@ def require_same_minor(built: dict[str, str], installed: dict[str, str]) -> None
 
 
 def compiled_module(name: str, part: str) -> Any:
-    """Import one of the project's compiled modules.
+    """Import one of the project's compiled modules and return it.
 
     Args:
-        name: name of the module; the libraries that it links to have been loaded already.
-        part: name of the module for people, as in 'the compiled part of the polish'.
+        name: name of the module; the libraries that it links to must have been loaded already.
+        part: description of the module in the message, such as 'the compiled part of the polish'.
 
     Raises:
         BridgeError: the module is missing or cannot be loaded.

@@ -72,8 +72,8 @@ class Mesh:
     """A triangle mesh file (STL, OBJ, PLY or OFF).
 
     Attributes:
-        path: the file.
-        scale: (3,) factor per axis.
+        path: path of the file.
+        scale: (3,) factors from the file's coordinates to metres, one per axis.
     """
 
     path: Path
@@ -90,8 +90,8 @@ class Body:
     Attributes:
         name: name of the body, unique within the cell or the robot.
         shape: geometry of the body.
-        pose: (4, 4) frame of the shape in its parent frame (world for the environment, flange for a
-            tool).
+        pose: (4, 4) frame of the shape in its parent frame: the world for a body of the
+            environment, the flange for a body of a tool.
     """
 
     name: str
@@ -117,11 +117,11 @@ class Capsule:
 
 @dataclass(frozen=True)
 class ToolLoad:
-    """The tool as a rigid body on the flange.
+    """Mass and inertia of a tool on the flange.
 
     Attributes:
-        mass: [kg].
-        centre_of_mass: (3,) in the flange frame [m].
+        mass: mass [kg].
+        centre_of_mass: (3,) centre of mass in the flange frame [m].
         inertia: (3, 3) about the centre of mass, flange axes [kg m^2].
     """
 
@@ -238,10 +238,10 @@ class Payload:
     """The payload, called the box.
 
     Attributes:
-        size: (3,) edge lengths along the box axes [m]; for another shape those of a box, centred at
-            the frame, that contains it.
-        mass: [kg].
-        centre_of_mass: (3,) in the box frame [m].
+        size: (3,) edge lengths along the box axes [m]; for another shape the edge lengths of a box,
+            centred at the frame, that contains the shape.
+        mass: mass [kg].
+        centre_of_mass: (3,) centre of mass in the box frame [m].
         inertia: (3, 3) about the centre of mass, box axes [kg m^2].
         velocity_max, acceleration_max: limits of the box's translation [m/s, m/s^2].
         angular_velocity_max, angular_acceleration_max: limits of the box's rotation [rad/s,
@@ -274,25 +274,26 @@ force."""
 
 @dataclass(frozen=True)
 class Contact:
-    """The frictional contact between one robot's pad and the box.
+    """The frictional contact between one robot's pad, or hand, and the box.
 
     Attributes:
         T_box_pad: (4, 4) pad frame in the box frame. Its z axis is the contact normal, which points
             into the box.
         friction: Coulomb coefficient.
-        patch_radius: radius of a round contact patch, half the diagonal of a rectangular one [m].
-        half_sides: half the sides of a rectangular patch along the pad's x and y axes [m]; None
-            for a round one.
+        patch_radius: radius of a round contact patch, or half the diagonal of a rectangular patch
+            [m].
+        half_sides: half the sides of a rectangular patch along the pad's x and y axes [m]; None for
+            a round patch.
         further: other pads of the same robot, rigidly mounted beside the first, as on a fork, in an
             array of cups or in a gripper. They have the first pad's friction, patch, kind and
             holding force.
-        kind: kind of the hand. A cup presses along its ring-shaped lip, the others over their whole
-            patch.
-        holding_force: own holding force of a hand: vacuum times area, pull of a magnet, closing
-            force of a gripper [N]; zero for a pad.
-        layer_shear: stiffness of the elastic layer along the patch over that normal to it; the
-            default is that of rubber, which keeps its volume.
-        layer_stiffness: normal stiffness per area over that of other layers.
+        kind: kind of pad or hand. A cup presses along its ring-shaped lip, all others press over
+            their whole patch.
+        holding_force: force with which a hand pulls or clamps the payload by itself: vacuum times
+            area, pull of a magnet, closing force of a gripper [N]; zero for a pad.
+        layer_shear: stiffness of the elastic layer along the patch, over its stiffness normal to
+            the patch; the default is the ratio of rubber, which keeps its volume.
+        layer_stiffness: normal stiffness per area of the elastic layer, relative to the other pads.
     """
 
     T_box_pad: Array
@@ -312,7 +313,7 @@ class Contact:
 
     @property
     def area(self) -> float:
-        """Area within the patch's rim [m^2]."""
+        """Area of the contact patch, or within the rim of a cup [m^2]."""
         if self.half_sides is None:
             return float(np.pi * self.patch_radius**2)
         return float(4.0 * np.prod(self.half_sides))
@@ -323,22 +324,22 @@ class Uncertainty:
     """Largest deviation of each quantity from its nominal value while the robots hold the box.
 
     Attributes:
-        friction: share by which either friction coefficient may be lower or higher.
-        mass: share by which the mass may be lower or higher.
-        centre_of_mass: (3,) half the width of its range, along the box axes [m].
-        pad_position: distance by which either pad may be displaced in its contact plane [m].
-        disturbance: (3,) largest additional acceleration of the box, along the world's axes, in
-            either direction [m/s^2].
+        friction: relative deviation of either friction coefficient, up or down.
+        mass: relative deviation of the mass, up or down.
+        centre_of_mass: (3,) deviation of the centre of mass along the box axes, in either direction
+            [m].
+        pad_position: displacement of either pad in its contact plane [m].
+        disturbance: (3,) additional acceleration of the box along the world axes, in either
+            direction [m/s^2].
         tracking: share of the commanded normal force that may be missing.
         internal_force: tangential force with which the arms may push against each other [N].
-        tilt: angle of either pad against its face [rad].
-        relative_position: error of the pads' positions relative to each other, along their faces
-            [m].
+        tilt: angle between either pad and the face that it touches [rad].
+        relative_position: error of the pads' positions relative to each other, along the faces [m].
         relative_angle: error of the pads' directions relative to each other [rad].
         stiffness: tangential stiffness of either arm at its pad [N/m], which turns
             `relative_position` into a force. Zero if unknown; `relative_position` then displaces
             the pads.
-        stated: True if the cell states the uncertainty, False for the usual one.
+        stated: True if the workcell file states the uncertainty, False for the usual uncertainty.
     """
 
     friction: Annotated[float, quantity.SHARE] = 0.0
@@ -361,23 +362,27 @@ class Uncertainty:
 
     @property
     def title(self) -> str:
-        """Name of the uncertainty in messages: stated or usual."""
+        """Name of the uncertainty in messages, which says whether the cell states it or it is the
+        usual one."""
         return "the cell's [uncertainty]" if self.stated else "the usual uncertainty"
 
     @property
     def opposed_force(self) -> float:
-        """Tangential force with which the arms push against each other [N]. Both arms are springs
-        in series."""
+        """Largest tangential force with which the arms push against each other [N]:
+        `internal_force`, plus the force of `relative_position` on both arms as springs in
+        series."""
         return self.internal_force + self.stiffness * self.relative_position / 2.0
 
     @property
     def apart(self) -> float:
-        """Largest displacement of the pads relative to each other along their faces [m]."""
+        """Largest displacement of the pads relative to each other along the faces [m]; zero if
+        `stiffness` turns the displacement into a force."""
         return 0.0 if self.stiffness else self.relative_position
 
     @property
     def turned(self) -> float:
-        """Largest angle of a pad against its face, from tilt and relative orientation [rad]."""
+        """Largest angle between a pad and the face that it touches, from `tilt` and
+        `relative_angle` [rad]."""
         return self.tilt + self.relative_angle
 
     def scaled(self, factor: float) -> Uncertainty:
@@ -385,8 +390,11 @@ class Uncertainty:
         return replace(self, **{name: factor * getattr(self, name) for name in RANGES})
 
     def changed(self, by: float | Mapping[str, float]) -> Uncertainty:
-        """Return the uncertainty with every range multiplied by a factor, or with some ranges
-        replaced by name. One number stands for all three axes.
+        """Return the uncertainty with other ranges.
+
+        Args:
+            by: factor on every range; or new values of single ranges by name, one number for all
+                three axes of a vector.
 
         Raises:
             SettingsError: a name is not the name of a range.
@@ -469,11 +477,12 @@ class Handling:
         pressing_speed: largest speed of the pads between the stand-off and the box [m/s].
         pressing_rate: largest rate of the normal forces while pressing and releasing [N/s].
         lifting_speed: largest speed of the box while it is lifted and set down [m/s].
-        lift_height: height of the carry's start above the box on its support [m]; None for the
-            height above the body beneath it.
-        set_down_height: height of the carry's goal above the box on its support [m]; None likewise.
-        partner_stop: distance by which the pads may move apart along the path if one arm stops on
-            its own, until the other arm has stopped too [m]; None for no limit.
+        lift_height: height by which the box is lifted from its support to the carry's start [m];
+            None for the height above the body beneath the box.
+        set_down_height: height by which the box is lowered from the carry's goal to its support
+            [m]; None for the height above the body beneath the box.
+        partner_stop: largest distance by which the pads may move apart along the path if one arm
+            stops on its own, until the other arm has stopped too [m]; None for no limit.
         grip_time: time from switching the outputs of hands until the hands hold, or have released
             [s].
         grip_limit: longest additional wait for the inputs of hands [s].
@@ -500,14 +509,14 @@ class Handling:
 
 @dataclass(frozen=True)
 class Reading:
-    """State of a workcell when it was read.
+    """Digests of a workcell at the time when it was read from its file.
 
     Attributes:
         files: SHA-256 over the workcell file and the content of every file it names.
-        values: SHA-256 over every value of the records; files count by their path relative to the
-            workcell file.
-        named: paths in the records, and arguments with which each robot's description is expanded.
-            They decide which files describe the cell.
+        values: SHA-256 over every value of the records; a path counts relative to the workcell
+            file.
+        named: paths in the records, and the arguments with which each robot's description is
+            expanded. They decide which files describe the cell.
     """
 
     files: str
@@ -516,7 +525,12 @@ class Reading:
 
 
 def reading_of(workcell: Any, files: str) -> Reading:
-    """Compute the reading of a workcell in its present state."""
+    """Compute the digests of a workcell in its present state.
+
+    Args:
+        workcell: the workcell.
+        files: digest of the workcell's files, which is copied to the result.
+    """
     arms = [(r.urdf, r.package_dirs, r.xacro_arguments, r.srdf) for r in workcell.robots]
     values = digest_of_parts(workcell, workcell.source.parent)
     return Reading(files, values, frozenset([*_paths(workcell), *map(repr, arms)]))
@@ -548,12 +562,11 @@ SEARCHED_BRANCH = -2
 
 @dataclass(frozen=True)
 class IgnoredPair:
-    """Two bodies, or groups of bodies, that are not checked for collision against each other, with
-    the user's reason.
+    """Two bodies, or groups of bodies, that are not checked for collision against each other.
 
     Attributes:
-        first, second: names of bodies, or patterns with `*` and `?` that stand for several.
-        reason: text that is shown wherever pairs are listed.
+        first, second: names of bodies, or patterns with `*` and `?` that stand for several bodies.
+        reason: the user's reason, shown wherever pairs are listed.
     """
 
     first: Label
@@ -608,8 +621,8 @@ class Workcell:
     text: bytes | None = field(default=None, repr=False)
 
     def stack_joint_limits(self, name: str) -> Array:
-        """Return a joint limit of both robots by its attribute's name, side by side (all
-        joints,)."""
+        """Return the joint limits `name`, an attribute of `Robot` such as 'velocity_max', of both
+        robots in one array (all joints,)."""
         return np.concatenate([getattr(robot, name) for robot in self.robots])
 
     @cached_property
@@ -640,23 +653,27 @@ class Workcell:
 
     @cached_property
     def has_offset_pads(self) -> bool:
-        """True if the contacts are offset laterally."""
+        """True if the contacts are offset perpendicular to the normal of contact 1."""
         return self.pad_offset > OFFSET_TOLERANCE
 
     @cached_property
     def pads(self) -> tuple[Contact, ...]:
-        """All pads: those of the first robot, then those of the second."""
+        """All pads of both contacts: those of the first robot, then those of the second."""
         return tuple(pad for contact in self.contacts for pad in (contact, *contact.further))
 
     @cached_property
     def pad_robots(self) -> tuple[int, ...]:
-        """Index of the robot of each pad."""
+        """For each of `pads` the index of its robot."""
         return tuple(i for i, c in enumerate(self.contacts) for _ in range(1 + len(c.further)))
 
     @cached_property
     def digest(self) -> str:
-        """Key of the cell in caches and results: SHA-256 over the file and every file that it names
-        (URDF, meshes), and over the values if the cell was changed in memory; '' without files."""
+        """Key of the cell in caches and results: SHA-256 over the workcell file and every file that
+        it names (URDF, meshes), and over the values if the cell was changed in memory.
+
+        It is '' if the workcell was not read from a file, or names other files than it was read
+        with.
+        """
         if self.reading is None:
             return ""
         files, now = self.reading.files, reading_of(self, "")
@@ -668,13 +685,15 @@ class Workcell:
 
 
 def box_flange(robot: Robot, contact: Contact) -> Array:
-    """Compute T_box_flange (4, 4) of a robot that holds the box with its pad in this contact."""
+    """Compute the flange frame in the box frame, T_box_flange (4, 4), while a robot holds the box
+    with its pad in the contact `contact`."""
     known: Array | None = getattr(robot, "T_box_flange", None)  # of numbers that are symbols
     return contact.T_box_pad @ inverse(robot.T_flange_pad) if known is None else known
 
 
 def flange_lever(robot: Robot, contact: Contact) -> Array:
-    """Compute the vector (3,) from the flange to the nominal contact point, box axes [m]."""
+    """Compute the vector (3,) from a robot's flange to the nominal contact point, box axes [m],
+    while the robot holds the box."""
     known: Array | None = getattr(robot, "lever", None)
     return contact.T_box_pad[:3, 3] - box_flange(robot, contact)[:3, 3] if known is None else known
 

@@ -14,7 +14,13 @@ import numpy as np
 
 
 def digest_of_parts(value: Any, folder: Path = Path()) -> str:
-    """Compute the SHA-256 of a record's content, part by part. Paths count relative to `folder`."""
+    """Compute the SHA-256 (hexadecimal text) of a value's content: of a record field by field, of a
+    tuple entry by entry.
+
+    Args:
+        value: record, tuple, array or plain value.
+        folder: folder to which paths in the value count as relative.
+    """
     found, left = list[bytes](), [value]
     while left:
         part = left.pop()
@@ -94,26 +100,31 @@ def _record(kind: Hashable) -> tuple[bytes, tuple[str, ...]]:
 
 
 class ContentRecord:
-    """A record that caches its digest, so that equal records are recognised quickly."""
+    """Base class of records that cache their digest, so that equal records are recognised
+    quickly."""
 
     @cached_property
     def content(self) -> str:
-        """Digest of the whole record."""
+        """SHA-256 of the whole record, except the fields `source`, `reading` and `text`."""
         kind: Any = type(self)
         return digest_of_parts((kind, tuple(getattr(self, name) for name in _record(kind)[1])))
 
 
 class CacheKey:
-    """Key of a function with `functools.lru_cache`: keys with equal content are equal. Cells that
-    differ in few values share most cached results.
+    """Argument of a function with `functools.lru_cache`. Two keys are equal if their content is
+    equal, so that cells with equal parts share cached results.
 
     Attributes:
-        given: arguments of the function.
+        given: the values from which the function computes its result.
     """
 
     def __init__(self, *given: Any, known: Hashable = None) -> None:
-        """Store the arguments. `known` identifies them; if None, the digest of their whole content
-        does."""
+        """Store the values from which a function computes its result.
+
+        Args:
+            given: the values.
+            known: content by which keys are compared; None for the digest of `given`.
+        """
         self.given = given
         self._known = digest_of_parts(given) if known is None else known
 

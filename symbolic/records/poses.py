@@ -44,20 +44,21 @@ class Orientation:
 
     @property
     def is_vector(self) -> bool:
-        """True if the numbers are a rotation vector, False if they are angles, each periodic in
-        full turns."""
+        """True if the three numbers are a rotation vector; False if they are roll, pitch and yaw,
+        each periodic in full turns."""
         return self.rotation == "quaternion"
 
     @property
     def components(self) -> tuple[str, str, str]:
-        """Names of the three numbers."""
+        """Names of the three numbers, for messages and tables."""
         if self.is_vector:
             return ("rotation x", "rotation y", "rotation z")
         return ("roll", "pitch", "yaw")
 
     @cached_property
     def unwrapped(self) -> Callable[[Array], Array]:
-        """Function that unwraps the angles of numbers (..., n, 3) along a path."""
+        """Function that removes jumps by full turns from orientations (..., n, 3) [rad] of n poses
+        along a path. Rotation vectors are returned unchanged."""
         return np.asarray if self.is_vector else partial(np.unwrap, axis=-2)
 
 
@@ -71,7 +72,7 @@ def rotation_from_rpy(rpy: ArrayLike) -> Array:
         rpy: (..., 3) roll, pitch, yaw [rad].
 
     Returns:
-        (..., 3, 3).
+        (..., 3, 3) rotation matrices.
     """
     angles = np.moveaxis(np.asarray(rpy, dtype=float), -1, 0)
     (cr, cp, cy), (sr, sp, sy) = np.cos(angles), np.sin(angles)
@@ -107,7 +108,12 @@ def rotation_from_vector(vector: ArrayLike) -> Array:
 
 
 def box_rotation(orientation: Orientation, pose: ArrayLike) -> Array:
-    """Compute R_world_box (..., 3, 3) of poses (..., 6) [m, rad] in this orientation convention."""
+    """Compute the rotations R_world_box (..., 3, 3) of box poses.
+
+    Args:
+        orientation: convention of the last three numbers of a pose.
+        pose: (..., 6) poses [m, rad].
+    """
     numbers = np.asarray(pose, dtype=float)[..., 3:6]
     if orientation.is_vector:
         return np.asarray(rotation_from_vector(numbers) @ orientation.reference)
@@ -115,7 +121,12 @@ def box_rotation(orientation: Orientation, pose: ArrayLike) -> Array:
 
 
 def box_placement(orientation: Orientation, pose: ArrayLike) -> Array:
-    """Compute T_world_box (..., 4, 4) of poses (..., 6) [m, rad] in this orientation convention."""
+    """Compute the transforms T_world_box (..., 4, 4) of box poses.
+
+    Args:
+        orientation: convention of the last three numbers of a pose.
+        pose: (..., 6) poses [m, rad].
+    """
     given = np.asarray(pose, dtype=float)
     T = np.zeros((*given.shape[:-1], 4, 4))
     T[..., :3, :3] = box_rotation(orientation, given)
@@ -125,7 +136,7 @@ def box_placement(orientation: Orientation, pose: ArrayLike) -> Array:
 
 
 def pose_matrix(xyz: ArrayLike, rpy: ArrayLike) -> Array:
-    """Compute the transform (4, 4) of a position [m] and roll, pitch, yaw [rad]."""
+    """Compute the transform (4, 4) of a position (3,) [m] and of roll, pitch, yaw (3,) [rad]."""
     return transform(rotation_from_rpy(rpy), xyz)
 
 
@@ -138,7 +149,8 @@ def transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
 
 
 def axes_with_z(axis: Array) -> Array:
-    """Compute a rotation (3, 3) whose third column is the unit axis (3,)."""
+    """Compute a rotation (3, 3) whose third column is the unit vector `axis` (3,). The other two
+    columns are any that complete it."""
     helper = np.eye(3)[int(np.argmin(np.abs(axis)))]
     x = np.cross(helper, axis)
     x /= np.linalg.norm(x)
@@ -146,7 +158,8 @@ def axes_with_z(axis: Array) -> Array:
 
 
 def inverse(T_a_b: Array) -> Array:
-    """Invert a rigid transform: T_b_a of T_a_b, by the transposed rotation."""
+    """Invert a rigid transform T_a_b (4, 4): return T_b_a, computed with the transposed
+    rotation."""
     rotation = T_a_b[:3, :3].T
     return transform(rotation, -rotation @ T_a_b[:3, 3])
 

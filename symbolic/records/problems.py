@@ -29,7 +29,13 @@ LONGEST_SUGGESTION = 200
 
 @dataclass
 class Problems:
-    """The problems found so far, as pairs of key path and text."""
+    """Problems found in a file so far.
+
+    Attributes:
+        found: pairs of key path and text, at most `MOST_PROBLEMS`.
+        uncounted: number of problems beyond these.
+        open: True if unknown keys are allowed.
+    """
 
     found: list[tuple[str, str]] = field(default_factory=list)
 
@@ -39,10 +45,11 @@ class Problems:
     """True if unknown keys are no problem."""
 
     def add(self, path: str, text: str) -> None:
-        """Record that the value at key path `path` is wrong. `text` states the found and the
-        allowed value.
+        """Record a problem; after `MOST_PROBLEMS` problems only count it.
 
-        After `MOST_PROBLEMS` problems are only counted.
+        Args:
+            path: key path of the wrong value.
+            text: the value that was found, and what is allowed.
         """
         if len(self.found) < MOST_PROBLEMS:
             told = text if len(text) <= MOST_LETTERS else f"{text[: MOST_LETTERS - 4]} ..."
@@ -59,16 +66,17 @@ class Problems:
         )
 
     def messages(self) -> tuple[str, ...]:
-        """Return all problems as `key.path: text`, and a line with the number of further ones."""
+        """Return all recorded problems as `key.path: text`, then a line with the number of further
+        problems if there are any."""
         told = tuple(f"{path}: {text}" for path, text in self.found)
         return (*told, f"and {self.uncounted} more") if self.uncounted else told
 
 
 class FirstProblem(Problems):
-    """Collector that raises the first problem at once."""
+    """Collector of problems that raises the first problem as an error at once."""
 
     def add(self, path: str, text: str) -> None:
-        """Raise the problem.
+        """Raise the problem as an error.
 
         Raises:
             ValueError: always; the message has the key path and the text.
@@ -81,7 +89,8 @@ def _is_within(path: str, prefix: str) -> bool:
 
 
 def suggestion(word: str, candidates: Iterable[str]) -> str:
-    """Return a 'did you mean' for a misspelt word, or '' if no candidate is similar."""
+    """Return the text '; did you mean ...?' with the candidate that is most similar to a misspelt
+    word; '' if none is similar."""
     if len(word) > LONGEST_SUGGESTION:
         return ""
     close = difflib.get_close_matches(word, list(candidates), n=1, cutoff=0.6)
@@ -111,7 +120,8 @@ _short.maxlist = _short.maxdict = 60
 
 
 def text_problem(value: Any) -> str:
-    """Return what is wrong with a value as a text for reports; '' if nothing is."""
+    """Return what is wrong with a value that should be a text for reports; '' if nothing is
+    wrong."""
     if not isinstance(value, str):
         return "allowed is a text"
     if not value.strip():
@@ -130,8 +140,8 @@ Label = Annotated[str, TextPattern(text_problem)]
 
 
 def text_pattern(pattern: str, meaning: str) -> TextPattern:
-    """Return a `TextPattern` of the texts that match a regular expression; `meaning` describes it
-    in messages."""
+    """Return a `TextPattern` that allows the texts that match the regular expression `pattern`;
+    `meaning` describes them in messages."""
     form = re.compile(pattern)
 
     def problem(value: Any) -> str:
@@ -144,7 +154,8 @@ def text_pattern(pattern: str, meaning: str) -> TextPattern:
 
 
 def matching(pattern: str, names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names that match a pattern: `*` stands for any text, `?` for any character.
+    """Return the names that match a pattern, in which `*` stands for any text and `?` for any
+    character.
 
     A pattern that equals a name matches this name only, even if it contains such characters.
     """

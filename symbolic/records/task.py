@@ -46,10 +46,10 @@ class Waypoint:
 
 @dataclass(frozen=True)
 class RedundantJoint:
-    """A joint beyond the six that follow the box: its path is part of the decision vector.
+    """A joint beyond the six joints of an arm that follow the box. Its path is part of the decision
+    vector: a spline, like the box path, through values at the waypoints.
 
-    The spline of the box path joins its values at the waypoints. A joint that moves both arms of a
-    machine is one redundant joint, not two.
+    A joint of a machine that moves both arms is one redundant joint, not two.
 
     Attributes:
         name: robot and joint, such as 'north/panda_joint3'.
@@ -73,7 +73,7 @@ class RedundantJoint:
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """(n_waypoints,) True for waypoints at which the value is a decision variable."""
+        """(n_waypoints,) booleans, True where the joint position is a decision variable."""
         return np.asarray(self.lower < self.upper)
 
 
@@ -136,8 +136,8 @@ class Task:
 
     @cached_property
     def redundant_places(self) -> tuple[tuple[tuple[int, int], ...], ...]:
-        """For each robot one pair per redundant joint of the robot: its index among the arm's
-        joints, and its index in the extended pose."""
+        """For each robot its redundant joints, each as a pair: index among the arm's joints, and
+        index in the extended pose (6 + m,)."""
         return tuple(
             tuple(
                 (joint.drives[arm], POSE_SIZE + k)
@@ -155,18 +155,19 @@ class Task:
     @cached_property
     def n_path(self) -> int:
         """Number of variables of the path: six per free waypoint (paper Eq. 14), then the free
-        values of the redundant joints, joint by joint."""
+        positions of the redundant joints, joint by joint."""
         return len(self.free_entries[0])
 
     @cached_property
     def n_box(self) -> int:
-        """Number of variables of the box path, the first of the decision vector."""
+        """Number of variables of the box path: six per free waypoint. They come first in the
+        decision vector."""
         return POSE_SIZE * len(self.free_indices)
 
     @cached_property
     def free_entries(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Rows and columns (n_path,) of the path's variables among the extended waypoints
-        (n_waypoints, 6 + m), whose columns are the pose and the redundant joints."""
+        """Row and column (n_path,) of each path variable in the matrix of the extended waypoints
+        (n_waypoints, 6 + m): one row per waypoint, with pose and redundant joints as columns."""
         free = np.array(self.free_indices, dtype=np.intp)
         rows, columns = [np.repeat(free, POSE_SIZE)], [np.tile(np.arange(POSE_SIZE), len(free))]
         for k, joint in enumerate(self.redundant):
@@ -180,8 +181,8 @@ class Task:
 
     @cached_property
     def initial_time(self) -> float:
-        """Time along the straight pieces of the hand-made trajectory at the reference speeds
-        [s]."""
+        """Duration of the hand-made trajectory on straight lines between its waypoints, at the
+        reference speeds [s]."""
         steps = np.diff(waypoints_of(self, initial_decision(self)), axis=0)
         lengths = np.linalg.norm(steps[:, :3], axis=1) / self.reference_speed
         turns = np.linalg.norm(steps[:, 3:], axis=1) / self.reference_angular_speed
@@ -189,8 +190,8 @@ class Task:
 
     @cached_property
     def fixed_waypoints(self) -> Array:
-        """(n_waypoints, 6 + m) extended waypoints in which free entries have their lower bounds;
-        read-only."""
+        """(n_waypoints, 6 + m) poses and redundant joints at all waypoints [m, rad]. Entries that
+        are decision variables have their lower bounds here. The array is read-only."""
         poses = np.array([waypoint.lower for waypoint in self.waypoints])
         points = np.column_stack([poses, *[joint.lower for joint in self.redundant]])
         points.flags.writeable = False
@@ -198,12 +199,12 @@ class Task:
 
     @cached_property
     def law(self) -> TimeLaw:
-        """The time law with the name `time_law`."""
+        """Record of the time law that `time_law` names."""
         return TIME_LAWS[self.time_law]
 
     @cached_property
     def n_var(self) -> int:
-        """Number of decision variables: the variables of the path, and in drivable cells the force
+        """Number of decision variables: those of the path and, in drivable cells, the force
         limit."""
         return self.n_path + self.law.is_drivable
 
@@ -229,19 +230,19 @@ class Task:
 
 
 def components(orientation: Orientation) -> tuple[str, ...]:
-    """Return the names of the six entries of a pose."""
+    """Return the names of the six entries of a pose in this orientation convention."""
     return ("x", "y", "z", *orientation.components)
 
 
 def waypoints_of(task: Task, x: Array) -> Array:
-    """Return all waypoints (..., n_waypoints, 6) of decision vectors x (..., n_var), with unwrapped
-    angles."""
+    """Return the box poses at all waypoints (..., n_waypoints, 6) [m, rad] of decision vectors x
+    (..., n_var), with unwrapped angles."""
     return extended_waypoints(task, x)[..., :POSE_SIZE]
 
 
 def extended_waypoints(task: Task, x: Array) -> Array:
-    """Return all extended waypoints (..., n_waypoints, 6 + m) of decision vectors x (..., n_var):
-    poses, then redundant joints."""
+    """Return the box pose and the redundant joints at all waypoints, (..., n_waypoints, 6 + m), of
+    decision vectors x (..., n_var), with unwrapped angles."""
     points = np.empty((*x.shape[:-1], *task.fixed_waypoints.shape))
     points[...] = task.fixed_waypoints
     rows, columns = task.free_entries
@@ -251,23 +252,34 @@ def extended_waypoints(task: Task, x: Array) -> Array:
 
 
 def place_redundant(task: Task, extended: Array, joints: Sequence[Array]) -> None:
-    """Write the redundant joints of extended poses (n, 6 + m) into the joints (n, joints) of both
-    arms, in place."""
+    """Copy the redundant joints of n extended poses into the joint positions of both arms, in
+    place.
+
+    Args:
+        task: task with m redundant joints.
+        extended: (n, 6 + m) box poses, then redundant joints.
+        joints: for each arm its joint positions (n, joints), which are changed.
+    """
     for arm, q in enumerate(joints):
         for joint, place in task.redundant_places[arm]:
             q[:, joint] = extended[:, place]
 
 
 def decision_of(task: Task, waypoints: Array) -> Array:
-    """Return the decision vector (n_var,) of all extended waypoints (n_waypoints, 6 + m). A force
-    limit gets its upper bound."""
+    """Return the decision vector (n_var,) of a path through given waypoints. In drivable cells its
+    force limit is the upper bound.
+
+    Args:
+        task: the task.
+        waypoints: (n_waypoints, 6 + m) box poses and redundant joints at all waypoints.
+    """
     path = np.array(waypoints[task.free_entries], dtype=float)
     return np.append(path, task.force_limit[1]) if task.law.is_drivable else path
 
 
 def initial_decision(task: Task) -> Array:
-    """Return the decision vector (n_var,) of the hand-made trajectory. A force limit gets its upper
-    bound."""
+    """Return the decision vector (n_var,) of the hand-made trajectory. In drivable cells its force
+    limit is the upper bound."""
     points = np.array([waypoint.lower for waypoint in task.waypoints])
     points[list(task.free_indices)] = task.initial
     return decision_of(task, _beside_initial(task, points))
@@ -278,8 +290,12 @@ def _beside_initial(task: Task, poses: Array) -> Array:
 
 
 def straight_line(task: Task) -> Array:
-    """Return the decision vector (n_var,) with free waypoints evenly spaced on straight lines
-    between the fixed ones. Redundant joints are those of the hand-made trajectory."""
+    """Return the decision vector (n_var,) of a path with free waypoints evenly spaced on straight
+    lines between the fixed waypoints.
+
+    Redundant joints have the values of the hand-made trajectory. In drivable cells the force limit
+    is the upper bound.
+    """
     fixed = [i for i, waypoint in enumerate(task.waypoints) if waypoint.is_fixed]
     poses = np.array([waypoint.lower for waypoint in task.waypoints])
     numbers = np.arange(len(task.waypoints))
@@ -288,8 +304,8 @@ def straight_line(task: Task) -> Array:
 
 
 def variable_names(task: Task) -> tuple[str, ...]:
-    """Return the names of the decision variables (n_var,). Waypoints count from 1, after the
-    start."""
+    """Return a name for each of the n_var decision variables, such as 'waypoint 1, x'. The start is
+    waypoint 0."""
     names = [*components(task.orientation), *(joint.name for joint in task.redundant)]
     rows, columns = task.free_entries
     found = [f"waypoint {row}, {names[column]}" for row, column in zip(rows, columns, strict=True)]

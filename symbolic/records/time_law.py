@@ -12,16 +12,16 @@ CONSTANT, RAMPED, OPTIMAL = "constant", "ramped", "optimal"
 
 @dataclass(frozen=True)
 class TimeLaw:
-    """The rule by which a path gets its times.
+    """Rule that assigns times to the samples of a path.
 
     Attributes:
         name: name in workcell files.
         title: name in sentences.
-        is_drivable: True if every path gets its fastest timing from rest to rest within all limits
-            and a force limit, which is then the last decision variable. False if the times follow
-            from the path by an expression.
-        has_differences: True if velocity and acceleration at a sample are finite differences with
-            its neighbours.
+        is_drivable: True if a solver finds the fastest timing of each path, from rest to rest
+            within all limits and a force limit, which is then the last decision variable. False if
+            the times follow from the path by an expression.
+        has_differences: True if velocity and acceleration at a sample are finite differences of
+            neighbouring samples.
     """
 
     name: str
