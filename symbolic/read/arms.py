@@ -38,6 +38,10 @@ Positions = tuple[tuple[str, float], ...]
 def chain_joints(urdf: Urdf, root: str, tip: str) -> tuple[str, ...]:
     """Return the moving joints between two links, from the root to the tip.
 
+    Args:
+        urdf: the description.
+        root, tip: names of the links.
+
     Raises:
         RobotModelError: a link does not exist, or the tip does not descend from the root.
     """
@@ -139,8 +143,9 @@ def _mass(link: ElementTree.Element) -> float:
 
 
 def without_links(urdf: Urdf, patterns: tuple[str, ...]) -> Urdf:
-    """Return a description without some links, without all links behind them, and without the
-    joints that move these.
+    """Return a description without some links and all links behind them.
+
+    The joints that move these links are removed too.
 
     Args:
         urdf: the description.
@@ -335,13 +340,14 @@ def flange_problem(model: pin.Model, flange: str) -> str:
 
 
 def link_frame(model: pin.Model, link: str) -> int:
-    """Return the index of a link's frame; a joint may have the same name."""
+    """Return the index of a link's frame in a model, even if a joint has the same name."""
     return int(model.getFrameId(link, pin.FrameType.BODY))
 
 
 def link_lengths(model: pin.Model, flange: str) -> Array:
-    """Compute the distances (n,) [m] from each joint of an arm to the next, and from the last joint
-    to the flange."""
+    """Compute the distances (n,) from each joint of an arm to the next, the last to the
+    flange [m].
+    """
     offsets = [model.jointPlacements[joint].translation for joint in range(2, model.njoints)]
     offsets.append(model.frames[link_frame(model, flange)].placement.translation)
     return np.asarray(np.linalg.norm(offsets, axis=1))
@@ -469,8 +475,10 @@ def _is_behind(urdf: Urdf, link: str, joints: Collection[str]) -> bool:
 
 
 def _carriers(robot: Robot) -> dict[str, str]:
-    """Return the last arm joint before each link with shapes; 'universe' for a link that does not
-    move."""
+    """Return for each link with shapes the last arm joint before it, by the link's name.
+
+    The value is 'universe' for a link that does not move.
+    """
     model = arm_model(robot)
     links = robot_urdf(robot).collisions
     return {link: model.names[model.frames[link_frame(model, link)].parentJoint] for link in links}
@@ -487,11 +495,11 @@ def _mount(robot: Robot, still: Collection[str]) -> str:
 
 
 def body_names(workcell: Workcell) -> dict[str, tuple[str, ...]]:
-    """Return the names by which collision pairs are addressed, by owner: `payload`, `environment`
-    or a robot's name.
+    """Return the names of all bodies for the keys that name collision pairs, by owner.
 
-    The payload is `payload`, an environment body has its own name, a link or tool body of a robot
-    is `ROBOT/NAME`. Fixed links of a machine with both arms have the name of the first robot.
+    The owners are `payload`, `environment` and both robots. The payload is called `payload`; a body
+    of the environment has its own name; a link or tool body of a robot is `ROBOT/NAME`. Fixed links
+    of a machine with both arms have the name of the first robot.
     """
     names = {
         PAYLOAD_NAME: (PAYLOAD_NAME,),

@@ -1,6 +1,8 @@
-"""Read a workcell from a TOML file, unchanged or with changed values. docs/reference/workcell.md
-describes every key. Names, references, reach and other conditions that involve several sections are
-checked last."""
+"""Read a workcell from a TOML file, unchanged or with changed values.
+
+docs/reference/workcell.md describes every key. Conditions that involve several sections (names,
+references, reach and others) are checked last.
+"""
 
 from __future__ import annotations
 
@@ -95,7 +97,7 @@ def load(
 
 
 def changed(workcell: Workcell, changes: Mapping[str, Any]) -> Workcell:
-    """Return the workcell with changed values of some keys of its file, checked like a file.
+    """Return the workcell with changed values in its file. The result is checked like a file.
 
     Args:
         workcell: a workcell that was read from a file.
@@ -176,11 +178,11 @@ def _build(
 
 
 def _digest(content: bytes, workcell: Workcell) -> str:
-    """Compute the SHA-256 of a workcell file and of the content of every file it names.
+    """Compute the SHA-256 of a workcell file and of the content of every file that it names.
 
-    Only the content of the files counts, not their place: the bytes of the workcell file; for each
+    The places of the files do not count. The order is: the bytes of the workcell file; for each
     robot its URDF (a xacro file in expanded form), the meshes that the URDF names, and its SRDF;
-    then the meshes of tools, environment and payload, in order.
+    the meshes of tools, environment and payload.
 
     Raises:
         OutsideError: a file cannot be read, or all together are too large.
@@ -227,8 +229,12 @@ def _content(path: Path, most: int) -> bytes:
 
 
 def with_branches(content: bytes, data: Mapping[str, Any], decided: tuple[int, int]) -> bytes:
-    """Return the text of a workcell file with `start_branch = "search"` replaced by the chosen
-    branches.
+    """Return the text of a workcell file in which chosen start branches replace "search".
+
+    Args:
+        content: content of the file.
+        data: parsed content of the file.
+        decided: for each robot the index of the chosen branch.
 
     Raises:
         SettingsError: the file is written in a way that cannot be edited.
@@ -291,13 +297,17 @@ def changed_text(content: bytes, changes: Mapping[str, Any], file: str) -> bytes
 
 @lru_cache(maxsize=4)
 def _tables_of(content: bytes) -> dict[str, Any]:
-    """Parse the tables of a file. The result is cached, because many variants of one cell are
-    tried; callers must not modify it."""
+    """Parse the tables of a file. The result is cached; callers must not modify it."""
     return safe_io.toml_tables(content)
 
 
 def _owners(table: Any, path: str) -> Iterator[tuple[dict[str, Any], str]]:
-    """Yield every table in which a key path ends, with the last key of the path."""
+    """Yield every table that contains the last key of a key path, and this key.
+
+    Args:
+        table: the table at which the path begins.
+        path: the key path (`changed_text`).
+    """
     key, _, rest = path.partition(".")
     name, bracket, index = key.partition("[")
     if bracket:
@@ -315,8 +325,13 @@ def _owners(table: Any, path: str) -> Iterator[tuple[dict[str, Any], str]]:
 
 
 def _among(tables: list[dict[str, Any]], rest: str) -> Iterator[tuple[dict[str, Any], str]]:
-    """Yield the tables of `_owners` from an array of tables, selected by index or name, or from all
-    of them."""
+    """Yield the results of `_owners` for tables of an array.
+
+    Args:
+        tables: the tables of the array.
+        rest: rest of the key path. If it begins with an index or a table's name, one table is
+            selected; otherwise all.
+    """
     if found := _INDEX.match(rest):
         k = int(found[1])
         if k < len(tables):
@@ -506,10 +521,11 @@ def check_reach(workcell: Workcell, problems: Problems) -> None:
 
 
 def stretched_length(robot: Robot) -> tuple[Array, float]:
-    """Return the first joint's position (3,) in the world and an upper bound of the reach [m].
+    """Return the position (3,) of an arm's first joint in the world and an upper bound of its reach
+    [m].
 
-    The bound is the sum of the distances from joint to joint and to the flange, and of the travels
-    of sliding joints.
+    The bound is the sum of the distances from joint to joint and to the flange, and of the
+    travels of sliding joints.
 
     Raises:
         RobotModelError: the robot's model is not a serial arm.
@@ -536,8 +552,13 @@ def _fixed_poses(workcell: Workcell) -> Iterator[tuple[str, Array]]:
 
 
 def check_all(workcell: Workcell, problems: Problems, reach: bool) -> None:
-    """Make every check across sections that needs no inverse kinematics. `reach` is the argument of
-    `load`."""
+    """Make every check across sections that needs no inverse kinematics.
+
+    Args:
+        workcell: the workcell.
+        problems: collector of problems.
+        reach: True to check that fixed poses are within the arms' reach.
+    """
     checks: tuple[Callable[[Workcell, Problems], None], ...] = (
         check_machine,
         check_shapes,

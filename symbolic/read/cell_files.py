@@ -1,11 +1,11 @@
-"""A workcell file and every file it names, as one value that can be stored and unpacked.
+"""A workcell file and all files that it names, as one value that can be stored and unpacked.
 
-The layout keeps the relative references in the file valid, so the workcell's digest stays the same.
-Absolute references are replaced by relative ones. Unpacking writes below one folder only, and
-refuses files that refer to anything outside it.
+Relative references in the workcell file stay valid, so its digest does not change. Absolute
+references are replaced by relative ones. Files are unpacked below one folder only; a stored file
+that refers to anything outside of it is refused.
 
-The drivable variant of a cell is the same cell under the time law `OPTIMAL`. Its file is the
-original text with one key changed; comments and everything else stay.
+The drivable variant of a cell is the same cell with the time law `OPTIMAL`. Only this key of the
+file's text is changed; comments and everything else stay.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ _UNSAFE = r"[\x00-\x1f\x7f/\\:]"
 
 @dataclass(frozen=True)
 class CellFiles:
-    """A workcell's files.
+    """A workcell file and the files that it names.
 
     Attributes:
         workcell: path of the workcell file among `files`.
@@ -102,11 +102,16 @@ def _collected(
 
 
 def unpack_cell(stored: CellFiles, folder: Path, check_digest: bool = True) -> Workcell:
-    """Write a cell's files below a folder and read the workcell from there.
+    """Write a cell's files below a folder, and read the workcell from there.
+
+    Args:
+        stored: the files.
+        folder: the folder; files in it are not overwritten.
+        check_digest: True to check that the workcell's digest is the stored one.
 
     Raises:
-        BundleError: a path would leave the folder, a reference points outside of it, or the
-            workcell is not the one that was stored.
+        BundleError: a path would leave the folder, a reference points outside of it, a file cannot
+            be written, or the workcell is not valid or not the stored one.
     """
     root = folder.resolve()
     named = {"files": stored.files, "folders": stored.folders, "workcell": (stored.workcell,)}
@@ -136,7 +141,14 @@ Encoding = Literal["utf-8", "zlib+base64"]
 
 @dataclass(frozen=True)
 class StoredFile:
-    """A file as JSON values: text unchanged, binary and large files compressed."""
+    """A file as JSON values.
+
+    Attributes:
+        path: relative POSIX path of the file.
+        sha256: checksum of the content.
+        encoding: 'utf-8' for text as it is; 'zlib+base64' for binary and large files.
+        content: the encoded content.
+    """
 
     path: str
     sha256: str
@@ -155,7 +167,7 @@ class StoredFiles:
 
 
 def cell_to_json(stored: CellFiles) -> dict[str, Any]:
-    """Convert the files to the JSON values of `StoredFiles`."""
+    """Convert a workcell's files to the JSON values of `StoredFiles`."""
     files = [asdict(_packed(name, stored.files[name])) for name in sorted(stored.files)]
     return {
         "workcell": stored.workcell,
@@ -166,7 +178,7 @@ def cell_to_json(stored: CellFiles) -> dict[str, Any]:
 
 
 def cell_from_json(data: Any) -> CellFiles:
-    """Read the files from JSON values, checking every field.
+    """Read a workcell's files from the JSON values of `StoredFiles`, and check every field.
 
     Raises:
         BundleError: a field is wrong; the message names it.
@@ -269,8 +281,10 @@ def _check_references(stored: CellFiles, root: Path) -> None:
 
 
 class CellCollector:
-    """Collector of a workcell's files that assigns each file a path relative to the workcell
-    file."""
+    """Collector of the files of a workcell.
+
+    Each file gets a path relative to the workcell file.
+    """
 
     def __init__(self, source: Path, text: bytes | None = None) -> None:
         self._source = source
@@ -348,7 +362,13 @@ class CellCollector:
         return f"embedded/{self._moved}/{name or 'folder'}"
 
     def _with_meshes(self, robot: Robot, place: str, packages: list[tuple[Path, str]]) -> bytes:
-        """Add the meshes of a URDF. Return its content with absolute addresses replaced."""
+        """Add the meshes of a robot's URDF, and return the URDF with absolute addresses replaced.
+
+        Args:
+            robot: the robot.
+            place: path of the URDF among the collected files.
+            packages: package folders on this machine, each with its path among the collected files.
+        """
         path = robot.urdf
         with _as_bundle_errors():
             content = description_content(path, robot.xacro_arguments, robot.package_dirs)
@@ -372,8 +392,15 @@ class CellCollector:
     def _own_place(
         address: str, urdf: Path, place: str, packages: list[tuple[Path, str]]
     ) -> str | None:
-        """Return the path of a mesh within the workcell's own folders, or None if it lies
-        outside them."""
+        """Return the path of a mesh among the collected files; None if the mesh is outside the
+        workcell's folders.
+
+        Args:
+            address: address of the mesh in the URDF.
+            urdf: path of the URDF on this machine.
+            place: path of the URDF among the collected files.
+            packages: package folders on this machine, each with its path among the collected files.
+        """
         if address.startswith(PACKAGE_SCHEME):
             held = (at for folder, at in packages if resolve_mesh(address, urdf, (folder,)))
             folder = next(held, None)
@@ -389,7 +416,7 @@ def _content(path: Path, most: int) -> bytes:
 
 @contextmanager
 def _as_bundle_errors(subject: str = "") -> Iterator[None]:
-    """Convert errors of other modules to a `BundleError` about `subject`."""
+    """Convert errors that are raised in the `with` block to a `BundleError` about `subject`."""
     try:
         yield
     except DualArmError as error:
@@ -423,8 +450,12 @@ def parse_toml(content: bytes) -> dict[str, Any]:
 
 
 def references(data: Mapping[str, Any]) -> Iterator[tuple[str, list[str] | None]]:
-    """Yield every file that a workcell names: the reference and, for a URDF, its package folders,
-    else None.
+    """Yield every path or address by which a workcell file names a file.
+
+    With each comes the list of package folders for a URDF, None for other files.
+
+    Args:
+        data: the tables of the workcell file.
 
     Raises:
         BundleError: a key is missing or has another type.

@@ -1,7 +1,7 @@
-"""Locations of robot descriptions and their meshes, and the expansion of xacro macros.
+"""Places of robot descriptions and meshes, and the expansion of xacro macros.
 
-Packages are looked up in given folders, above the description, where ROS's environment variables
-point, and beside the installed Python packages.
+Packages are looked up in given folders, above the description, in the folders of ROS's environment
+variables, and beside the installed Python packages.
 
 The package xacro expands macros in a separate process: `python -m symbolic.read.descriptions`.
 Expansion evaluates Python expressions and calls macros as often as the file asks for. So the
@@ -84,8 +84,10 @@ def _packages(name: str, package_dirs: Sequence[Path], description: Path) -> Ite
 
 
 def package_in(folder: Path, name: str) -> Path | None:
-    """Return the subfolder called `name`, else a subfolder whose package.xml has this name, else
-    None."""
+    """Return the folder of a package inside a folder; None if there is none.
+
+    This is the subfolder called `name`, else a subfolder whose package.xml has this name.
+    """
     if os.path.isdir(folder / name):
         return folder / name
     try:
@@ -110,10 +112,14 @@ def _package_name(folder: Path) -> str | None:
 def further_package_dirs(
     addresses: Iterable[str], package_dirs: Sequence[Path], description: Path
 ) -> tuple[Path, ...]:
-    """Return folders outside `package_dirs` that hold the packages of mesh addresses, each folder
-    once.
+    """Return the folders, outside `package_dirs`, that contain the packages of mesh addresses.
 
-    Packages that are already in a given folder, and packages that are not found, are left out.
+    Each folder is listed once. Packages that are not found are left out.
+
+    Args:
+        addresses: addresses of meshes.
+        package_dirs: folders of packages that the workcell names.
+        description: the file with the addresses.
     """
     names = dict.fromkeys(
         address.removeprefix(PACKAGE_SCHEME).split("/", 1)[0]
@@ -130,7 +136,7 @@ def _paths(variable: str) -> Iterator[Path]:
 
 
 def _below(folder: Path, name: str, levels: int) -> Iterator[Path]:
-    """Yield folders with this name and a package.xml, in a folder or up to `levels` below it."""
+    """Yield the folders of a package in a folder, or up to `levels` below it."""
     is_package = (folder / "package.xml").is_file()
     if folder.name == name and is_package:
         yield folder
@@ -149,6 +155,11 @@ def resolve_mesh(address: str, urdf: Path, package_dirs: Sequence[Path]) -> Path
 
     `package://NAME/REST` is looked up in the package NAME of each folder (`package_in`), `file://`
     addresses are absolute, and other addresses are relative to the folder of the URDF.
+
+    Args:
+        address: the address in the URDF.
+        urdf: path of the URDF.
+        package_dirs: folders in which packages are looked up.
     """
     if address.startswith(PACKAGE_SCHEME):
         name, _, rest = address.removeprefix(PACKAGE_SCHEME).partition("/")
@@ -221,8 +232,10 @@ def is_mjcf(content: bytes) -> bool:
 
 
 def is_xacro(content: bytes) -> bool:
-    """Return True if a description has macros to expand. The suffix does not tell, since generated
-    URDFs often keep it."""
+    """Return True if a description has macros to expand.
+
+    The suffix of the file does not show this, since generated URDFs often keep `.xacro`.
+    """
     return _XACRO.search(content) is not None and _MACRO.search(content) is not None
 
 
@@ -233,11 +246,13 @@ _NOMINAL = re.compile(r"default_kinematics\.ya?ml$", re.IGNORECASE)
 
 
 def nominal_kinematics(content: bytes, arguments: Arguments) -> str:
-    """Return the name of a xacro file's argument for an arm's calibration, if the value is missing
-    or the maker's nominal one; '' if there is no such argument or it has a calibrated value.
+    """Return the name of the xacro argument for an arm's calibration if no calibration is given.
+
+    The value is then missing, or is the maker's nominal one. The result is '' if a calibration is
+    given or the file has no such argument.
 
     Args:
-        content: content of the file.
+        content: content of the xacro file.
         arguments: values of the file's arguments, by name.
     """
     given = dict(arguments)
@@ -251,10 +266,10 @@ def nominal_kinematics(content: bytes, arguments: Arguments) -> str:
 def _expanded(
     path: Path, content: bytes, arguments: Arguments, package_dirs: tuple[Path, ...]
 ) -> tuple[bytes | None, Parts]:
-    """Return the expanded text and, for every included file, its path and digest.
+    """Return the expanded text of a xacro file, and path and digest of every included file.
 
-    The text is None if the expansion took too long. This is cached too, since both robots of a cell
-    may name the file.
+    The text is None if the expansion took too long. Results are cached, since both robots of a cell
+    may name one file.
     """
     answer = _answer(
         {
@@ -271,7 +286,7 @@ def _expanded(
 
 
 def _answer(request: Any) -> Any:
-    """Send a request to the expanding process. Return its answer; None after a timeout."""
+    """Send a request to the process that expands, and return its answer; None after a timeout."""
     paths = [os.path.abspath(entry) for entry in sys.path]
     with tempfile.TemporaryFile() as answer:
         try:
@@ -299,7 +314,7 @@ def _answer(request: Any) -> Any:
 
 
 def _state(paths: Iterable[str]) -> Parts:
-    """Return each file with the digest of its content, empty if it is missing."""
+    """Return each path with the digest of the file's content, empty for a missing file."""
     return tuple((path, _digest(path) if os.path.exists(path) else b"") for path in paths)
 
 

@@ -27,12 +27,12 @@ INLINE = ("base", "pad")
 
 
 def completed(text: str, data: Mapping[str, Any], changes: Changes) -> str:
-    """Return the text of a workcell file with values set.
+    """Return the text of a workcell file with some values set.
 
     Args:
-        text: text of the file; '' to write `data` without comments.
-        data: parsed content of the file, without the values to be replaced.
-        changes: the values to set.
+        text: text of the file; '' to write `data` with the changes, without comments.
+        data: parsed content of the file.
+        changes: nested tables with the values to set; None removes a key.
 
     Raises:
         SettingsError: the file is written in a way that cannot be edited.
@@ -77,10 +77,11 @@ def with_paths(data: Mapping[str, Any], change: Callable[[str], str]) -> Changes
 
 
 def extended(text: str, data: Mapping[str, Any], key: str, tables: list[dict[str, Any]]) -> str:
-    """Return a workcell file's text with tables appended to an array, such as `[[environment]]`.
+    """Return a workcell file's text with tables appended to an array such as `[[environment]]`.
 
     Args:
-        text, data: text of the file, and its parsed content.
+        text: text of the file.
+        data: parsed content of the file.
         key: key of the array at the top level; the file may lack it.
         tables: the new tables.
 
@@ -104,7 +105,13 @@ def extended(text: str, data: Mapping[str, Any], key: str, tables: list[dict[str
 def _edited(
     text: str, wanted: Mapping[str, Any], edit: Callable[[tomlkit.TOMLDocument], None]
 ) -> str:
-    """Edit a text, and check that the result parses to the wanted values."""
+    """Edit a text, and check the result.
+
+    Args:
+        text: TOML text of the file.
+        wanted: content that the edited text has to have.
+        edit: function that edits the document.
+    """
     with suppress(OutsideError, TOMLKitError, LookupError, TypeError, ValueError):
         document = tomlkit.parse(text)
         edit(document)
@@ -118,7 +125,7 @@ def _edited(
 
 
 def _alike(found: Any, wanted: Any) -> bool:
-    """Return True if values are equal. NaN counts as equal to NaN; the reader refuses it later."""
+    """Return True if two nested values are equal; NaN equals NaN."""
     if isinstance(found, Mapping) and isinstance(wanted, Mapping):
         return found.keys() == wanted.keys() and all(_alike(found[k], wanted[k]) for k in found)
     if isinstance(found, list) and isinstance(wanted, list):
@@ -127,8 +134,13 @@ def _alike(found: Any, wanted: Any) -> bool:
 
 
 def merged(data: Any, changes: Any) -> Any:
-    """Merge changes into plain values; None removes a key. Two sets of changes can be merged
-    too."""
+    """Merge nested changes into nested values; None in the changes removes a key.
+
+    Args:
+        data: the values, or other changes to be merged with.
+        changes: the changes. An array of tables is merged table by table if the lengths agree; any
+            other value replaces the old one.
+    """
     if isinstance(changes, Mapping) and isinstance(data, Mapping):
         found = dict(data)
         for key, value in changes.items():
@@ -165,8 +177,10 @@ def _apply(place: Any, changes: Any) -> None:
 
 
 def _cut_heading(place: Any) -> list[Any]:
-    """Remove and return the blank lines and comments at the end of a table. They belong to the next
-    table, and new tables go before them."""
+    """Remove and return the blank lines and comments at the end of a table's text.
+
+    They belong to the next table, so new keys go before them.
+    """
     body = _last_body(place)
     blank = end = len(body)
     while end and body[end - 1][0] is None:

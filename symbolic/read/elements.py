@@ -99,11 +99,15 @@ class ElementReader:
         return self.element.tag
 
     def at(self, key: str) -> str:
-        """Return the name of an attribute for messages, with the place of the element."""
+        """Return the place of an attribute for messages: the place of the element, then the
+        attribute's name.
+        """
         return f"{self.path} {key}".lstrip()
 
     def named(self, tag: str) -> dict[str, ElementReader]:
-        """Return the inner elements with a tag by their names, which must be unique."""
+        """Return the inner elements with a tag, by their names; record a problem for a repeated
+        name.
+        """
         found: dict[str, ElementReader] = {}
         for index, element in enumerate(self.element.findall(tag)):
             name = ElementReader(element, f"{self.path}/{tag}[{index}]".lstrip("/"), self.problems)
@@ -115,13 +119,15 @@ class ElementReader:
         return found
 
     def child(self, tag: str) -> ElementReader | None:
-        """Return the first inner element of a tag, or None."""
+        """Return the first inner element with a tag; None if there is none."""
         element = self.element.find(tag)
         return None if element is None else self._inner(element, tag)
 
     def required(self, tag: str) -> ElementReader:
-        """Return the first inner element of a tag. If it is missing, record this problem and return
-        a reader that reports no others."""
+        """Return the first inner element with a tag.
+
+        If it is missing, record a problem and return a reader that reports nothing further.
+        """
         found = self.child(tag)
         if found is None:
             self.problems.add(self.path, f"<{tag}> is missing")
@@ -129,7 +135,7 @@ class ElementReader:
         return found
 
     def all(self, tag: str) -> list[ElementReader]:
-        """Return every inner element with a tag. None of them is added to `kept`."""
+        """Return every inner element with a tag. These are not added to `kept`."""
         path = f"{self.path}/{tag}".removeprefix("/")
         return [
             ElementReader(element, f"{path}[{index}]", self.problems)
@@ -137,7 +143,7 @@ class ElementReader:
         ]
 
     def one_of(self, tags: Sequence[str]) -> ElementReader:
-        """Return the first inner element, whose tag must be one of `tags`."""
+        """Return the first inner element; record a problem if its tag is not among `tags`."""
         element = next(iter(self.element), None)
         if element is None or element.tag not in tags:
             found = "nothing" if element is None else shown(element.tag)
@@ -146,7 +152,7 @@ class ElementReader:
         return self._inner(element, element.tag)
 
     def raw(self, key: str) -> str | None:
-        """Return an attribute as written."""
+        """Return an attribute as written; None if it is missing."""
         return self.element.get(key)
 
     def inner_text(self, tag: str) -> str:
@@ -154,7 +160,7 @@ class ElementReader:
         return (self.element.findtext(tag) or "").strip()
 
     def text(self, key: str, most: int = MOST_NAME) -> str:
-        """Read a printable, non-empty text; '' after a problem."""
+        """Read an attribute as a printable text of 1 to `most` characters; '' after a problem."""
         value = self.raw(key)
         if value is None:
             self.problems.add(self.at(key), "is missing")
@@ -168,7 +174,7 @@ class ElementReader:
         return ""
 
     def choice(self, key: str, allowed: Sequence[str]) -> str:
-        """Read one of the allowed words; '' after a problem."""
+        """Read an attribute that is one of the allowed words; '' after a problem."""
         value = self.text(key)
         if value and value not in allowed:
             hint = suggestion(value, allowed)
@@ -180,17 +186,27 @@ class ElementReader:
         return value
 
     def number(self, key: str, allowed: Range, default: str | None = None) -> float:
-        """Read a finite number within a range."""
+        """Read an attribute as a finite number within a range."""
         return float(self.numbers(key, (allowed,), default)[0])
 
     def numbers(self, key: str, allowed: Sequence[Range], default: str | None = None) -> Array:
-        """Read numbers separated by spaces, one range each."""
+        """Read an attribute with numbers separated by spaces.
+
+        Args:
+            key: name of the attribute.
+            allowed: range of each number.
+            default: text for a missing attribute; None if it is required.
+        """
         if key in self.element.attrib:
             self.kept.set(key, self.element.attrib[key])
         return self._numbers(self.at(key), self.element.get(key, default), allowed)
 
     def content(self, allowed: Sequence[Range]) -> Array:
-        """Read the numbers between the element's tags, one range each."""
+        """Read the numbers between the element's tags, separated by spaces.
+
+        Args:
+            allowed: range of each number.
+        """
         return self._numbers(self.path, self.element.text, allowed)
 
     def _numbers(self, path: str, value: str | None, allowed: Sequence[Range]) -> Array:

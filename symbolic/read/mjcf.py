@@ -25,7 +25,7 @@ NO_READER = "is a file of MuJoCo, whose reader is not installed: pip install 'du
 
 
 def compiled(path: Path) -> Any:
-    """Return MuJoCo's module, the file's `MjSpec`, and its compiled model.
+    """Load an MJCF file with MuJoCo. Return the module `mujoco`, the file's `MjSpec` and `MjModel`.
 
     Raises:
         OutsideError: MuJoCo is not installed, or refuses the file.
@@ -44,8 +44,13 @@ def compiled(path: Path) -> Any:
 def geom_shape(
     mujoco: Any, model: Any, geom: int
 ) -> tuple[str, Box | Sphere | Cylinder | Capsule | None]:
-    """Return the kind of a geom, such as 'box', and its shape; None in place of a shape that is not
-    supported."""
+    """Return the kind of a geom, such as 'box', and its shape; None for an unsupported shape.
+
+    Args:
+        mujoco: the module `mujoco`.
+        model: the compiled model.
+        geom: index of the geom.
+    """
     kind = mujoco.mjtGeom(int(model.geom_type[geom])).name[7:].lower()
     size = model.geom_size[geom]
     radius, length = float(size[0]), 2.0 * float(size[1])
@@ -112,8 +117,10 @@ class _Writer:
         return ElementTree.tostring(self._root)
 
     def _joints(self, body: int, name: str) -> None:
-        """Write the joints between a body and its parent; each turns about its own point of the
-        body."""
+        """Write the joints between a body and its parent.
+
+        Each joint has its own point in the body about which it turns.
+        """
         model, kinds = self._model, self._mujoco.mjtJoint
         parent = self._names[model.body_parentid[body]]
         T_parent_body = self._pose(model.body_pos[body], model.body_quat[body])
@@ -155,8 +162,10 @@ class _Writer:
         return element
 
     def _effort(self, joint: int) -> float:
-        """Return the largest effort of a joint [N m or N]: the joint's own limit, else that of its
-        motors, else 0."""
+        """Return the largest effort of a joint [N m or N].
+
+        This is the limit of the joint, else the limit of its motors, else 0.
+        """
         model, words = self._model, self._mujoco
         if model.jnt_actfrclimited[joint]:
             return float(np.abs(model.jnt_actfrcrange[joint]).min())
@@ -220,7 +229,14 @@ class _Writer:
 def _add(
     parent: ElementTree.Element, tag: str, pose: Array | None = None, **said: Any
 ) -> ElementTree.Element:
-    """Add an inner element with an origin, and with texts and numbers as attributes."""
+    """Add an inner element to an XML element, and return it.
+
+    Args:
+        parent: the XML element.
+        tag: tag of the new element.
+        pose: (4, 4) origin of the new element; None for none.
+        said: attributes, as texts or numbers.
+    """
     written = {
         key: value if isinstance(value, str) else " ".join(map(repr, np.ravel(value).tolist()))
         for key, value in said.items()

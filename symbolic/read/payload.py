@@ -1,4 +1,6 @@
-"""Sections of a workcell file on payload and contacts: the box, and the poses of the pads on it."""
+"""The payload section and the contacts of a workcell file: the box, and the poses of the pads on
+it.
+"""
 
 from __future__ import annotations
 
@@ -21,7 +23,12 @@ PAYLOAD_KINDS = ("box", "cylinder", "mesh")
 
 
 def read_payload(table: TableReader, folder: Path) -> Payload:
-    """Read the payload. The path of a mesh is relative to `folder`."""
+    """Read the payload.
+
+    Args:
+        table: the payload's section of the workcell file.
+        folder: folder to which the path of a mesh is relative.
+    """
     kind = table.choice("kind", PAYLOAD_KINDS, "box")
     mass = table.number("mass", quantity.MASS)
     if kind == "mesh":
@@ -51,8 +58,13 @@ def read_payload(table: TableReader, folder: Path) -> Payload:
 
 
 def solid_box_inertia(size: Array, mass: float) -> Array:
-    """Compute the inertia (3, 3) [kg m^2] of a homogeneous cuboid about its centre, along its
-    edges."""
+    """Compute the inertia (3, 3) of a homogeneous cuboid about its centre, along its edges [kg
+    m^2].
+
+    Args:
+        size: (3,) edge lengths [m].
+        mass: mass [kg].
+    """
     squares = np.asarray(size) ** 2
     return read_only(np.diag(mass / 12 * (squares.sum() - squares)))
 
@@ -71,8 +83,10 @@ def _cylinder(table: TableReader, mass: float) -> Payload:
 
 
 def _mesh(table: TableReader, folder: Path, mass: float) -> Payload:
-    """Read a mesh payload with uniform density within its surface, or within its hull if the
-    surface has holes."""
+    """Read a payload with the shape of a mesh.
+
+    The density is uniform within the surface, or within the convex hull if the surface has holes.
+    """
     path = read_file(table, "path", folder, safe_io.MESH_BYTES)
     scale = table.vector("scale", (quantity.SCALE,) * 3, (1.0, 1.0, 1.0), filling=True)
     nothing = Payload(read_only(np.ones(3)), mass, np.zeros(3), np.eye(3))
@@ -124,7 +138,7 @@ ALONG_Z = 0.9  # share of a normal along z from which on a pad's x axis is measu
 
 
 def read_contact(table: TableReader, payload: Payload) -> Contact:
-    """Read one robot's pads on a payload."""
+    """Read the pads of one robot on the payload."""
     friction = table.number("friction", quantity.FRICTION)
     half_sides: tuple[float, float] | None = None
     if table.has("patch_size"):
@@ -155,7 +169,9 @@ def read_contact(table: TableReader, payload: Payload) -> Contact:
 
 
 def check_count(contacts: list[Contact], problems: Problems) -> None:
-    """Check that there are at most `MOST_PADS` pads."""
+    """Check that the contacts have at most `MOST_PADS` pads, or `MOST_HANDS` with holding
+    forces.
+    """
     count = sum(1 + len(contact.further) for contact in contacts)
     allowed = MOST_HANDS if any(contact.holding_force for contact in contacts) else MOST_PADS
     if count > allowed:
@@ -168,8 +184,16 @@ def _read_place(
     radius: float,
     half_sides: tuple[float, float] | None,
 ) -> Array:
-    """Read T_box_pad (4, 4), from a point on the surface or with an explicit normal; the identity
-    after a problem."""
+    """Read the pose T_box_pad (4, 4) of a pad; the identity after a problem.
+
+    The file states a point on a face of the payload, or a point and a normal.
+
+    Args:
+        table: the pad's table.
+        payload: the payload; None after problems with its shape.
+        radius: radius of the patch [m].
+        half_sides: half sides of a rectangular patch [m]; None for a round patch.
+    """
     point = table.vector("xyz", (quantity.POSITION,) * 3)
     spin = table.number("spin", quantity.ANGLE, 0.0)
     written = table.vector("normal", (quantity.DIRECTION,) * 3) if table.has("normal") else None
@@ -218,10 +242,17 @@ def _on_surface(
     radius: float,
     half_sides: tuple[float, float] | None,
 ) -> Array:
-    """Compute T_box_pad (4, 4) of a pad on a face; the identity if the point is on no face.
+    """Compute the pose T_box_pad (4, 4) of a pad on a face of a box or cylinder.
 
-    A point of a box has three distances from the middle, a point of a cylinder two: across the axis
-    and along it. The point is on a face if one of them has its largest value.
+    The result is the identity if the point is on no face, on an edge, or on a mesh.
+
+    Args:
+        table: the pad's table, for problems.
+        point: (3,) point in the box frame [m].
+        spin: rotation of the pad about the normal [rad].
+        payload: the payload.
+        radius: radius of the patch [m].
+        half_sides: half sides of a rectangular patch [m]; None for a round patch.
     """
     if isinstance(payload.shape, Mesh):
         table.add("xyz", "lies on a mesh; give the contact a normal, into the payload")

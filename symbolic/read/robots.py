@@ -62,12 +62,16 @@ MAX_START_BRANCH = 1000
 
 
 def read_robot(table: TableReader, folder: Path, stored: bool = False) -> tuple[Robot, int]:
-    """Read one arm and the index of its start branch (-1: best by the ranking, -2: searched for).
+    """Read one arm, and the index of its start branch.
 
     Args:
         table: the arm's section of the workcell file.
         folder: folder to which paths in the section are relative.
         stored: whether the cell was unpacked from an archive.
+
+    Returns:
+        The arm, and the index of the start branch: -1 for the best by the ranking, -2 if the file
+        says "search".
     """
     name = table.text("name")
     if "/" in name:
@@ -108,8 +112,7 @@ def read_robot(table: TableReader, folder: Path, stored: bool = False) -> tuple[
 
 
 def _read_redundant(table: TableReader, model: pin.Model | None) -> tuple[str, ...]:
-    """Read the names of the redundant joints in the file; () if the choice is left to the
-    program."""
+    """Read the names of the redundant joints; () if the file names none."""
     names = table.texts("redundant_joints", "names of joints")
     if model is None or not names:
         return names
@@ -152,7 +155,7 @@ def _warn_unjudged(robot: str) -> None:
 
 
 def _read_limits(table: TableReader, model: pin.Model | None) -> dict[str, Array | None]:
-    """Read the limits (n,) by key, from the file or else from the description."""
+    """Read the joint limits (n,) by key, from the file, else from the robot's description."""
     n, found = FOLLOWING if model is None else model.nq, dict[str, Array | None]()
     for key, (own, allowed) in LIMIT_KEYS.items():
         if key == "torque_max" and table.raw(key, None) == UNKNOWN_TORQUE:
@@ -205,13 +208,15 @@ MOST_FOLDERS = 100
 def _read_description(
     table: TableReader, folder: Path, stored: bool
 ) -> tuple[dict[str, Any], pin.Model | None]:
-    """Return a description as fields of `symbolic.records.Robot`, and the arm's model; None after
-    problems.
+    """Read the keys that describe an arm.
 
     Args:
         table: the robot's section.
         folder: folder to which paths in the section are relative.
         stored: whether the cell was unpacked from an archive.
+
+    Returns:
+        The values as fields of `symbolic.records.Robot`, and the arm's model, None after problems.
     """
     package_dirs = _read_folders(table, folder)
     own = table.table("xacro_arguments", {})
@@ -264,8 +269,10 @@ def _read_description(
 
 
 def _check_arguments(table: TableReader, path: Path, arguments: Arguments) -> None:
-    """Record a problem for arguments of a file that takes none; warn if a calibration is not
-    given."""
+    """Check that xacro arguments are given for xacro files only.
+
+    Warn if the argument with the arm's calibration is missing or nominal.
+    """
     content = safe_io.read_bytes(path, safe_io.URDF_BYTES)
     if not is_xacro(content):
         if arguments:
@@ -288,13 +295,13 @@ def _warn_nominal(robot: str, argument: str) -> None:
 
 
 def _argument(value: str, folder: Path) -> str:
-    """Return a xacro argument, with a relative path made absolute."""
+    """Return the value of a xacro argument, with a relative path made absolute."""
     return str((folder / value).resolve()) if value.startswith(RELATIVE) else value
 
 
 @contextmanager
 def _recorded(table: TableReader, key: str) -> Iterator[None]:
-    """Record errors in the content that a key names as problems of this key."""
+    """Record errors that are raised in the `with` block as problems of a key."""
     try:
         yield
     except UrdfError as error:
@@ -360,8 +367,10 @@ def _read_described(
 
 
 def _read_chain(table: TableReader) -> tuple[str, str]:
-    """Read the links at which the arm begins and ends; '' for the first if only the flange is
-    given."""
+    """Read the links at which the arm begins and ends.
+
+    The first name is '' if the file states the flange alone.
+    """
     if not table.has("chain"):
         return "", table.text("flange")
     table.refuse("chain", ("flange",))
@@ -376,7 +385,14 @@ def _read_chain(table: TableReader) -> tuple[str, str]:
 def _read_model(
     table: TableReader, urdf: Urdf, locked: Positions, root: str, flange: str
 ) -> pin.Model | None:
-    """Return the arm's model; after recorded problems None."""
+    """Return the arm's model; None if a problem is recorded.
+
+    Args:
+        table: the robot's section.
+        urdf: the robot's description.
+        locked: joints that the user holds, with their positions [rad or m].
+        root, flange: links at which the arm begins and ends; root '' for the whole description.
+    """
     moving: tuple[str, ...] | None = None
     model: pin.Model | None = None
     with _recorded(table, "urdf"):

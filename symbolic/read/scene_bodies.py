@@ -87,8 +87,15 @@ class SceneBuilder:
     names: set[str] = field(default_factory=lambda: {PAYLOAD_NAME})
 
     def add(self, name: str, shape: Shape | Capsule, pose: Array) -> None:
-        """Add a shape at its pose (4, 4) in the world, unless a workcell would refuse it. A capsule
-        becomes a cylinder and two spheres."""
+        """Add a shape as a body; leave it out, with a report, if a workcell would refuse it.
+
+        A capsule becomes a cylinder and two spheres.
+
+        Args:
+            name: name of the shape in the scene.
+            shape: the shape.
+            pose: (4, 4) in the world.
+        """
         if isinstance(shape, Capsule):
             self.add(name, Cylinder(shape.radius, shape.length), pose)
             for end in (-0.5, 0.5):
@@ -118,8 +125,14 @@ class SceneBuilder:
             self.bodies.append(body)
 
     def triangles(self, name: str, vertices: Array, faces: NDArray[np.int64], pose: Array) -> None:
-        """Add a mesh without a file: vertices (n, 3) [m], and indices (m, 3) of the vertices of
-        each face."""
+        """Add a mesh that is stated by its triangles.
+
+        Args:
+            name: name of the mesh in the scene.
+            vertices: (n, 3) vertices [m].
+            faces: (m, 3) indices of each triangle's vertices.
+            pose: (4, 4) in the world.
+        """
         import trimesh
 
         content = trimesh.exchange.stl.export_stl(trimesh.Trimesh(vertices, faces, process=False))
@@ -134,7 +147,15 @@ class SceneBuilder:
             self.files[file] = content
 
     def mesh(self, name: str, address: str, file: Path, scale: Array, pose: Array) -> None:
-        """Add a mesh that a scene's file names by an address."""
+        """Add a mesh that a scene's file names by an address.
+
+        Args:
+            name: name of the mesh in the scene.
+            address: the address.
+            file: the scene's file.
+            scale: (3,) scale factors along x, y and z.
+            pose: (4, 4) in the world.
+        """
         path = file_at(address, file)
         if path is None:
             self.leave(name, f"its mesh {shown(address)} is not found; {WHERE}")
@@ -142,7 +163,14 @@ class SceneBuilder:
             self.add(name, Mesh(path, scale), pose)
 
     def half_space(self, name: str, normal: Array, offset: float, pose: Array) -> None:
-        """Add the half-space normal . x + offset <= 0 of a frame at a pose (4, 4)."""
+        """Add the half-space of all points x with normal . x + offset <= 0 in a frame.
+
+        Args:
+            name: name of the plane in the scene.
+            normal: (3,) normal of the plane, of any length.
+            offset: offset of the plane [m, for a unit normal].
+            pose: (4, 4) of the frame in the world.
+        """
         length = float(np.linalg.norm(normal))
         if length < 1e-6:
             self.problems.add(name, "found a plane without a normal")
@@ -151,7 +179,7 @@ class SceneBuilder:
             self.plane(name, pose @ transform(axes_with_z(normal / length), foot))
 
     def plane(self, name: str, pose: Array) -> None:
-        """Add the half-space below a frame's x-y plane."""
+        """Add the half-space below the x-y plane of a frame with the pose (4, 4) in the world."""
         size = " x ".join(f"{side:g}" for side in SLAB)
         self.note(name, f"is a plane; a slab of {size} m below it takes its place")
         self.add(name, *slab_below(pose))
@@ -165,7 +193,7 @@ class SceneBuilder:
         self.notes.append(f"{safe_io.printable(name) or 'scene'}: {what}")
 
     def _name(self, name: str) -> str:
-        """Return a unique name without the characters of key paths and patterns."""
+        """Return a unique name without the characters that key paths and patterns use."""
         wanted = re.sub(r"[/.*?\[\]]+", "-", safe_io.printable(name)).strip() or "body"
         wanted = wanted[: MAX_NAME_LENGTH - 6].strip()
         free = (wanted if k == 1 else f"{wanted} {k}" for k in range(1, MOST_BODIES + 3))
@@ -173,8 +201,13 @@ class SceneBuilder:
 
 
 def _table(body: Body, folder: Path, meshes: Path) -> dict[str, Any]:
-    """Convert a body to a table of a workcell file. Mesh paths below `meshes` become relative to
-    `folder`."""
+    """Convert a body to a table of a workcell file.
+
+    Args:
+        body: the body.
+        folder: folder of the workcell file, to which mesh paths become relative.
+        meshes: folder to which relative mesh paths of the body refer.
+    """
     table: dict[str, Any] = {"name": body.name, "kind": type(body.shape).__name__.lower()}
     for key, value in vars(body.shape).items():
         if key == "path":
@@ -193,8 +226,14 @@ def _plain(values: Array) -> list[float]:
 
 
 def quaternion_pose(xyz: Array, xyzw: Array, at: str, problems: Problems) -> Array:
-    """Compute the pose (4, 4) of a position and a quaternion x, y, z, w. Four zeros mean no
-    rotation, as in MoveIt."""
+    """Compute a pose (4, 4) from a position and a quaternion.
+
+    Args:
+        xyz: (3,) position [m].
+        xyzw: (4,) quaternion x, y, z, w; four zeros mean no rotation, as in MoveIt.
+        at: place of the quaternion in the file, for messages.
+        problems: collector of problems.
+    """
     length = float(np.linalg.norm(xyzw))
     if length and abs(length - 1.0) > 1e-2:
         problems.add(at, f"found a quaternion of length {length:g}; allowed is 1")
@@ -211,8 +250,14 @@ _VARIABLES = ("GZ_SIM_RESOURCE_PATH", "GAZEBO_MODEL_PATH", "SDF_PATH")
 
 
 def file_at(address: str, file: Path) -> Path | None:
-    """Return the file behind an address in an SDF file. If the address is a model's folder, return
-    the model's description."""
+    """Return the file behind an address in a scene; None if it does not exist.
+
+    If the address is a model's folder, return the description of the model.
+
+    Args:
+        address: the address.
+        file: the scene's file.
+    """
     scheme, _, rest = address.rpartition("://")
     if not rest or "\0" in rest or scheme not in ("", "file", "model", "package"):
         return None

@@ -1,5 +1,8 @@
-"""Scenes of other programs as bodies of a cell's environment: SDF of Gazebo and Drake, planning
-scenes of MoveIt (the message in YAML, and the text that RViz saves), and MJCF."""
+"""Read scenes of other programs as bodies of a cell's environment.
+
+The formats are SDF (Gazebo, Drake), MJCF (MuJoCo), and planning scenes of MoveIt, either the
+message in YAML or the text that RViz saves.
+"""
 
 from __future__ import annotations
 
@@ -79,7 +82,15 @@ OWN = ("", "__model__", "__root__")
 
 @dataclass
 class _Scope:
-    """A scope of names, a world or a model, with its frames and the models in it."""
+    """A world or model of an SDF file, inside which names are unique.
+
+    Attributes:
+        part: the element of the world or model.
+        file: the file with the element.
+        frames: for each frame by name, the name of the frame to which it is relative, and its pose
+            (4, 4) there.
+        inner: the models inside, by name.
+    """
 
     part: ElementReader
     file: Path
@@ -92,7 +103,7 @@ class _Scope:
         self.frames[name] = (base, pose)
 
     def frame(self, name: str) -> Array:
-        """Compute the pose (4, 4) of a frame in the frame of the scope."""
+        """Compute the pose (4, 4) of a named frame in the frame of the world or model."""
         T_name, met = np.eye(4), 0
         while name not in (*OWN, "world") or (name == "world" and self.part.tag == "model"):
             head, _, rest = name.partition("::")
@@ -167,7 +178,12 @@ class _Sdf:
     def _place(
         self, scope: _Scope, name: str, model: _Scope, placed: tuple[str, Array], by: ElementReader
     ) -> None:
-        """Add a model at its pose. `placed` states the pose of the model's placement frame."""
+        """Add a model to a world or model (`scope`).
+
+        Args:
+            placed: name of a frame, and the pose (4, 4) of the model's placement frame in it.
+            by: the element that states the placement frame.
+        """
         base, pose = placed
         frame = by.raw("placement_frame") or by.inner_text("placement_frame")
         scope.enter(name, base, pose @ inverse(model.frame(frame)))
@@ -201,8 +217,10 @@ class _Sdf:
             self._place(scope, wanted or name, inner, placed, by)
 
     def _pose(self, part: ElementReader) -> tuple[str, Array]:
-        """Read the pose (4, 4) of an element and the name of the frame to which it is relative; ''
-        for the default frame."""
+        """Read the name of the frame to which an element's pose is relative, and the pose (4, 4).
+
+        The name is '' for the default frame.
+        """
         pose = part.child("pose")
         if pose is None:
             return "", np.eye(4)
@@ -277,7 +295,9 @@ _ADDED = (None, 0, "", "0", "\0", "ADD", "add")
 
 
 class _Loader(yaml.CSafeLoader):
-    """YAML loader that reads 1e-05 as a number, as the writers of these files mean it."""
+    """YAML loader that reads words like 1e-05 as numbers, as the programs that write them
+    intend.
+    """
 
 
 _Loader.add_implicit_resolver(
@@ -334,7 +354,10 @@ def _read_moveit(path: Path, found: SceneBuilder) -> None:
 def _object(
     table: TableReader, frames: Mapping[str, Array], path: Path, found: SceneBuilder
 ) -> None:
-    """Add one collision object: its primitives, meshes and planes."""
+    """Add one collision object of a planning scene: its primitives, meshes and planes.
+
+    The poses (4, 4) in `frames` are those of named frames in the world.
+    """
     name = str(table.raw("id", "") or "object")
     if table.raw("operation", None) not in _ADDED:
         found.leave(name, f"is not added: its operation is {shown(table.raw('operation'))}")
@@ -374,7 +397,14 @@ _PLACES = {"primitives": "primitive_poses", "meshes": "mesh_poses", "planes": "p
 
 
 def _frame(table: TableReader, place: str = "position", turn: str = "orientation") -> Array:
-    """Read a pose (4, 4), with numbers by letters or in a row. A missing part is zero."""
+    """Read a pose (4, 4) from a position and a quaternion; a missing one is zero.
+
+    Each is a table with the keys x, y, z (and w), or an array.
+
+    Args:
+        table: the table.
+        place, turn: keys of the position and of the quaternion.
+    """
     parts = []
     for key, letters in ((place, "xyz"), (turn, "xyzw")):
         if isinstance(table.raw(key, None), Mapping):
@@ -386,8 +416,16 @@ def _frame(table: TableReader, place: str = "position", turn: str = "orientation
 
 
 def _primitive(name: str, kind: str, sizes: Array, pose: Array, found: SceneBuilder) -> None:
-    """Add a primitive of MoveIt's message. The sizes of a cylinder are length and radius, those of
-    a plane its coefficients."""
+    """Add a primitive of MoveIt's message.
+
+    Args:
+        name: name of the body.
+        kind: kind of the primitive, such as 'box'.
+        sizes: edges (3,) of a box, radius (1,) of a sphere, length and radius (2,) of a cylinder
+            [m], or coefficients (4,) of a plane.
+        pose: (4, 4) in the world.
+        found: collector of bodies.
+    """
     match kind:
         case "box":
             found.add(name, Box(sizes), pose)
@@ -404,7 +442,7 @@ def _primitive(name: str, kind: str, sizes: Array, pose: Array, found: SceneBuil
 def _moveit_mesh(
     name: str, table: TableReader, pose: Array, path: Path, found: SceneBuilder
 ) -> None:
-    """Add a mesh by its address, or by its triangles."""
+    """Add a mesh that the message states by an address or by its triangles."""
     if table.has("resource"):
         scale = table.vector("dimensions", (ANY,) * 3, (1.0, 1.0, 1.0))
         found.mesh(name, str(table.raw("resource")), path, scale, pose)
@@ -424,7 +462,7 @@ def _moveit_mesh(
 
 
 def _triangles(name: str, vertices: Any, faces: Any, pose: Array, found: SceneBuilder) -> None:
-    """Add a mesh to the scene, given by the lists of vertices and of vertex indices in the file."""
+    """Add a mesh that a file states by lists of vertices and of vertex indices."""
     try:
         places = np.array(vertices, dtype=float).reshape(-1, 3)
         corners = np.array(faces, dtype=float).reshape(-1, 3)
@@ -442,8 +480,9 @@ def _triangles(name: str, vertices: Any, faces: Any, pose: Array, found: SceneBu
 
 
 def _read_moveit_text(path: Path, found: SceneBuilder) -> None:
-    """Add the objects of a scene in text format: for each a name after a star, then rows of
-    numbers.
+    """Add the objects of a scene in MoveIt's text format.
+
+    Each object begins with a line `*NAME`; rows of numbers follow.
 
     Raises:
         OutsideError: the file is not in this format.
@@ -463,8 +502,15 @@ def _read_moveit_text(path: Path, found: SceneBuilder) -> None:
 
 
 def _written_object(name: str, words: Sequence[str], placed: bool, found: SceneBuilder) -> None:
-    """Add one object of a scene in text format. In an old file shapes are relative to the world, in
-    a new file to the object."""
+    """Add one object of a scene in MoveIt's text format.
+
+    Args:
+        name: name of the object.
+        words: the words after the name.
+        placed: True in a new file, which states a pose of the object; False in an old file, whose
+            shapes are relative to the world.
+        found: collector of bodies.
+    """
     at = 0
 
     def numbers(count: int) -> Array:

@@ -183,7 +183,12 @@ def _body() -> Schema:
 
 
 def _fields(record: type, *without: str) -> dict[str, Schema]:
-    """Return the schemas of a record's fields, some excepted, with their meanings."""
+    """Return the schemas of a record's fields by name, with the meanings from its docstring.
+
+    Args:
+        record: class of the record.
+        without: names of fields to leave out.
+    """
     hints = get_type_hints(record, include_extras=True)
     keys = {field: kind for field, kind in hints.items() if field not in without}
     return _described(record, {key: _kind(kind) for key, kind in keys.items()})
@@ -215,7 +220,12 @@ def _kind(kind: Any) -> Schema:
 
 
 def _described(record: type, keys: dict[str, Schema]) -> dict[str, Schema]:
-    """Add the meanings of attributes, from the record's docstring, to the schemas of its fields."""
+    """Add descriptions to the schemas of a record's fields.
+
+    Args:
+        record: class of the record; the attributes in its docstring are the descriptions.
+        keys: schemas by field.
+    """
     text = (getdoc(record) or "").partition("Attributes:\n")[2].partition("\n\n")[0]
     entries = re.findall(r"^ {4}(\w[\w, ]*): (.*(?:\n {8}.*)*)", text, re.MULTILINE)
     meanings = {
@@ -244,7 +254,12 @@ def _table(keys: dict[str, Schema], required: Sequence[str] = ()) -> Schema:
 
 
 def _array(each: Schema | Sequence[Schema], least: int = 0, most: int | None = None) -> Schema:
-    """Return the schema of an array, with one schema for all entries or one per entry."""
+    """Return the schema of an array.
+
+    Args:
+        each: one schema for all entries, or a sequence with one schema per entry.
+        least, most: bounds of the number of entries, for one schema; most None for no bounds.
+    """
     if not isinstance(each, dict):
         sizes = {"minItems": len(each), "maxItems": len(each)}
         return {"type": "array", "prefixItems": list(each), **sizes}
@@ -258,8 +273,13 @@ def _number(allowed: Range | None, kind: str = "number") -> Schema:
 
 
 def _vector(allowed: Range, size: int, filling: bool = False) -> Schema:
-    """Return the schema of an array of numbers. With `filling`, one number may stand for all
-    entries."""
+    """Return the schema of an array of numbers.
+
+    Args:
+        allowed: range of every number.
+        size: number of entries.
+        filling: True if one number may stand for all entries.
+    """
     numbers = _array(_number(allowed), size, size)
     return _any(_number(allowed), numbers) if filling else numbers
 

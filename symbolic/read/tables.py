@@ -83,12 +83,15 @@ class TableReader:
         self.problems.add(self.at(key), text)
 
     def clean(self, *keys: str) -> bool:
-        """Return True if the values of these keys have no problems."""
+        """Return True if no problem is recorded for the values of these keys."""
         return self.problems.clean(*map(self.at, keys))
 
     def raw(self, key: str, default: Any = _REQUIRED) -> Any:
-        """Return a value as it is in the document. A missing required key is a problem and gives
-        None."""
+        """Return a value as it is in the document.
+
+        If the key is missing, return the default. Without a default, record a problem and return
+        None.
+        """
         self._known.add(key)
         if key in self._data:
             return self._data[key]
@@ -98,18 +101,23 @@ class TableReader:
         return default
 
     def has(self, key: str) -> bool:
-        """Return True if an optional key is present. `close` then does not report it as unknown."""
+        """Return True if an optional key is present. The key counts as known to `close`."""
         return self.raw(key, None) is not None
 
     def refuse(self, key: str, others: Sequence[str]) -> None:
-        """Record a problem if a key is present together with keys that it excludes."""
+        """Record a problem if a key is present together with another key.
+
+        Args:
+            key: the key.
+            others: keys that may not be present beside it.
+        """
         beside = " and ".join(repr(other) for other in others if other in self._data)
         self._known.update(others)
         if beside:
             self.add(key, f"found beside {beside}; allowed is one or the other")
 
     def close(self) -> None:
-        """Record every key that was not read as unknown."""
+        """Record a problem for every key of the table that no method has read."""
         unknown = [key for key in self._data if key not in self._known]
         allowed = ", ".join(sorted(self._known))
         for key in unknown[:MOST_UNKNOWN]:
@@ -122,15 +130,21 @@ class TableReader:
             )
 
     def value(self, key: str, kind: Any, default: Any = _REQUIRED) -> Any:
-        """Read a value that `checked` converts by an annotation. The default is returned
-        unchecked."""
+        """Read a value, checked and converted by `checked`.
+
+        Args:
+            key: key of the value.
+            kind: annotation that the value has to satisfy.
+            default: value for a missing key, returned unchecked; without it a missing key is a
+                problem.
+        """
         value = self.raw(key, default)
         if key in self._data and not (value is None and default is not _REQUIRED):
             return checked(kind, value, self.at(key), self.problems)
         return _stand_in(kind) if default is _REQUIRED else default
 
     def number(self, key: str, allowed: Range, default: float | None = None) -> float:
-        """Read a number within a range."""
+        """Read a number within a range. Without a default a missing key is a problem."""
         found: float = self.value(
             key, Annotated[float, allowed], _REQUIRED if default is None else default
         )
@@ -143,8 +157,14 @@ class TableReader:
         default: Sequence[float] | Array | None = None,
         filling: bool = False,
     ) -> Array:
-        """Read an array with one range per entry. With `filling`, one number stands for all
-        entries."""
+        """Read an array of numbers.
+
+        Args:
+            key: key of the array.
+            allowed: range of each entry.
+            default: the array for a missing key; None if the key is required.
+            filling: True if the file may state one number for all entries.
+        """
         value = self.raw(key, _REQUIRED if default is None else list(default))
         if value is None and (default is not None or key not in self):
             return read_only(np.ones(len(allowed)) if default is None else default)
@@ -165,8 +185,12 @@ class TableReader:
         return str(self.value(key, Label, _REQUIRED if default is None else default))
 
     def texts(self, key: str, meaning: str) -> tuple[str, ...]:
-        """Read an array of texts; () if it is missing or after a problem. `meaning` describes the
-        array in messages."""
+        """Read an array of texts; () if it is missing or after a problem.
+
+        Args:
+            key: key of the array.
+            meaning: description of the texts, for messages.
+        """
         value = self.raw(key, [])
         if isinstance(value, list) and all(isinstance(entry, str) and entry for entry in value):
             return tuple(value)
@@ -174,7 +198,14 @@ class TableReader:
         return ()
 
     def table(self, key: str, default: Mapping[str, Any] | None = None) -> TableReader:
-        """Read a sub-table. After a problem return an empty one that reports nothing further."""
+        """Read a sub-table.
+
+        After a problem return an empty reader, which reports nothing further.
+
+        Args:
+            key: key of the sub-table.
+            default: content for a missing key; None if the key is required.
+        """
         value = self.raw(key, _REQUIRED if default is None else default)
         if value is not None and isinstance(value, Mapping):
             return TableReader(value, self.at(key), self.problems)
@@ -183,9 +214,12 @@ class TableReader:
         return TableReader({}, self.at(key), Problems())
 
     def tables(self, key: str, exactly: int | None = None) -> list[TableReader]:
-        """Read an array of tables: optional and of any length, or with exactly `exactly` tables.
+        """Read an array of tables.
 
-        If there are too many, the first ones are returned.
+        Args:
+            key: key of the array.
+            exactly: required number of tables, of which no more are returned; None for an optional
+                array of any length.
         """
         value = self.raw(key, [] if exactly is None else _REQUIRED)
         if value is None:
@@ -202,7 +236,11 @@ class TableReader:
         ]
 
     def record(self, kind: type[Record], **given: Any) -> Record:
-        """Read a record whose fields are the table's keys, except those passed as `given`.
+        """Read a record whose fields are the keys of the table.
+
+        Args:
+            kind: class of the record.
+            given: values of fields that are not read from the table.
 
         Raises:
             ValueError: the record's own check refuses the values.
@@ -336,8 +374,15 @@ def _stand_in(kind: Any, marks: Sequence[Any] = ()) -> Any:
 
 
 def checked_number(value: Any, allowed: Range, path: str, problems: Problems) -> float:
-    """Return a value as a finite float within a range; otherwise record a problem and return a
-    placeholder."""
+    """Return a value as a finite float in a range; otherwise record a problem and return a
+    placeholder.
+
+    Args:
+        value: the value in the document.
+        allowed: the range.
+        path: key path of the value.
+        problems: collector of problems.
+    """
     if isinstance(value, bool) or not isinstance(value, int | float):
         problems.add(path, f"found {shown(value)}; allowed is a number, {allowed.allowed()}")
         return 1.0
@@ -356,8 +401,15 @@ def checked_number(value: Any, allowed: Range, path: str, problems: Problems) ->
 def checked_vector(
     value: Any, allowed: Sequence[Range], path: str, problems: Problems, filling: bool = False
 ) -> Array:
-    """Return a value as a read-only array; otherwise record problems and return a placeholder. With
-    `filling`, one number stands for all entries."""
+    """Return a value as a read-only array (n,); otherwise record problems and return a placeholder.
+
+    Args:
+        value: the value in the document.
+        allowed: ranges of the n entries.
+        path: key path of the value.
+        problems: collector of problems.
+        filling: True if one number may stand for all entries.
+    """
     if filling and not isinstance(value, list):
         return read_only(np.full(len(allowed), checked_number(value, allowed[0], path, problems)))
     if not isinstance(value, list) or len(value) != len(allowed):
@@ -374,8 +426,10 @@ def checked_vector(
 def _array(
     shape: Shape, marks: Sequence[Any], value: Any, path: str, problems: Problems
 ) -> np.ndarray[Any, Any]:
-    """Return a checked read-only array of numbers. They have to be finite, unless the annotation
-    allows missing entries."""
+    """Return a value as a read-only array of finite numbers, checked against an annotation.
+
+    NaN is accepted if the annotation allows missing entries.
+    """
     for mark in marks:
         if isinstance(mark, Range):
             filling = any(isinstance(other, BroadcastScalar) for other in marks)
@@ -416,7 +470,9 @@ SHAPES = {"box": Box, "cylinder": Cylinder, "sphere": Sphere, "mesh": Mesh}
 
 
 def read_pose(table: TableReader, key: str) -> Array:
-    """Read a transform (4, 4), read-only, from a sub-table {xyz, rpy}, both zero by default."""
+    """Read a pose (4, 4), read-only, from a sub-table with xyz [m] and rpy [rad], both zero by
+    default.
+    """
     inner = table.table(key)
     pose = _xyz_rpy(inner)
     inner.close()

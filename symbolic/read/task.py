@@ -1,9 +1,9 @@
-"""Task section of a workcell file, and the redundant joints: the joints beyond six, whose paths are
-decision variables.
+"""The task section of a workcell file, and the redundant joints.
 
-One posture path along the hand-made trajectory decides which joints are redundant and their initial
-positions. It moves all joints together by Newton steps of least norm that drift to the middle of
-the joint ranges as far as the box leaves them free (Liegeois, IEEE T-SMC 7(12), 1977).
+Redundant joints are an arm's joints beyond six; their paths are decision variables. A path of all
+joints along the hand-made trajectory decides which joints are redundant, and gives their initial
+positions. It is made by Newton steps of least norm that also drift to the middle of the joint
+ranges as far as the pose of the box allows (Liegeois, IEEE T-SMC 7(12), 1977).
 """
 
 from __future__ import annotations
@@ -54,8 +54,12 @@ FORCE_LIMIT_MARGIN = 1.001
 
 
 def read_task(table: TableReader, holding: Array) -> tuple[Task, tuple[RedundancyEntry, ...]]:
-    """Read the task (fixed poses, waypoints, sampling, limits) and the entries of redundant
-    joints."""
+    """Read the task (fixed poses, waypoints, sampling, limits) and the entries of redundant joints.
+
+    Args:
+        table: the task's section of the workcell file.
+        holding: holding force of each arm's hand, 0 for a pad [N].
+    """
     orientation = _orientation(table)
     names = components(orientation)
     start = _fixed(table, "start")
@@ -119,8 +123,10 @@ def _known_allocation(table: TableReader, key: str, usual: str) -> str:
 
 
 def _check_vectors(task: Task, problems: Problems) -> None:
-    """Check that every allowed rotation vector is clearly shorter than a full turn, where the map
-    from vectors to rotations is singular."""
+    """Check that every allowed rotation vector is shorter than `MOST_TURN`.
+
+    At a full turn the map from vectors to rotations is singular.
+    """
     for k, waypoint in enumerate(task.waypoints):
         farthest = np.maximum(np.abs(waypoint.lower[3:]), np.abs(waypoint.upper[3:]))
         if np.linalg.norm(farthest) > MOST_TURN:
@@ -133,8 +139,11 @@ def _check_vectors(task: Task, problems: Problems) -> None:
 
 
 def with_force_limit(workcell: Workcell) -> Workcell:
-    """Return the workcell with bounds of the force limit. If the file has none, they are the force
-    that holds the payload level and at rest plus a thousandth, and the smaller reference force."""
+    """Return the workcell with bounds of the force limit.
+
+    If the file states none, the lower bound is the force that holds the payload level and at rest
+    plus a thousandth of it, and the upper bound is the smaller reference force.
+    """
     task = workcell.task
     if np.isfinite(task.force_limit[1]):
         return workcell
@@ -174,7 +183,9 @@ def _fixed(table: TableReader, key: str) -> Waypoint:
 
 
 def _waypoints(table: TableReader, names: Sequence[str]) -> list[Waypoint]:
-    """Read one fixed waypoint, or `count` free ones that share their bounds."""
+    """Read an entry of the file: one fixed waypoint, or `count` free waypoints with the same
+    bounds.
+    """
     if table.has("fixed"):
         pose = table.vector("fixed", quantity.POSE)
         table.refuse("fixed", ("lower", "upper", "count"))
@@ -199,7 +210,9 @@ def _waypoints(table: TableReader, names: Sequence[str]) -> list[Waypoint]:
 
 
 def _read_initial(table: TableReader, free: list[Waypoint], names: Sequence[str]) -> Array:
-    """Read the initial free waypoints (n_free, 6). The default is the middle of the bounds."""
+    """Read the initial free waypoints (n_free, 6) [m, rad]. The default is the middle of the
+    bounds.
+    """
     value = table.raw("initial", None)
     path, problems = table.at("initial"), table.problems
     if value is None:
@@ -249,7 +262,8 @@ class RedundancyEntry:
     Attributes:
         path: key path of the entry.
         joint: 'robot/joint', or the name of a joint of either robot.
-        lower, upper, initial: (n_waypoints,) [rad or m]; None if the file does not state them.
+        lower, upper, initial: (n_waypoints,) bounds and initial positions at the waypoints [rad or
+            m]; None if the file does not state them.
     """
 
     path: str
@@ -260,7 +274,12 @@ class RedundancyEntry:
 
 
 def read_redundant(table: TableReader, n_waypoints: int) -> tuple[RedundancyEntry, ...]:
-    """Read the entries of `task.redundant`."""
+    """Read the entries of `task.redundant`.
+
+    Args:
+        table: the task's section of the workcell file.
+        n_waypoints: number of waypoints, fixed and free.
+    """
     found = []
     for entry in table.tables("redundant"):
         values = {
@@ -276,8 +295,15 @@ def read_redundant(table: TableReader, n_waypoints: int) -> tuple[RedundancyEntr
 def with_redundancy(
     workcell: Workcell, entries: Sequence[RedundancyEntry], problems: Problems
 ) -> Workcell:
-    """Return the workcell with its redundant joints. Joints and positions that the file does not
-    state are chosen automatically."""
+    """Return the workcell with its redundant joints.
+
+    Joints and positions that the file does not state are chosen automatically.
+
+    Args:
+        workcell: the workcell without redundant joints.
+        entries: entries of `task.redundant` in the file.
+        problems: collector of problems.
+    """
     if not problems.clean("robots", "task", "contacts", *SHAPE_KEYS):
         return workcell
     models = [arm_model(robot) for robot in workcell.robots]
@@ -323,8 +349,18 @@ def with_redundancy(
 def _choice(
     workcell: Workcell, i: int, entries: Sequence[RedundancyEntry], common: tuple[str, ...]
 ) -> tuple[PosturePath | None, tuple[str, ...]]:
-    """Return the redundant joints of arm i, and its path along the hand-made trajectory if it is
-    needed, else None."""
+    """Choose the redundant joints of one arm.
+
+    Args:
+        workcell: the workcell.
+        i: index of the arm.
+        entries: entries of `task.redundant` in the file.
+        common: names of joints that move both arms.
+
+    Returns:
+        The arm's path along the hand-made trajectory, or None if the file states all joints and
+        positions; the names of the redundant joints.
+    """
     robot = workcell.robots[i]
     model = arm_model(robot)
     names, beyond = list(model.names)[1:], model.nq - FOLLOWING
@@ -346,8 +382,10 @@ def _choice(
 
 
 def _entry(entries: Sequence[RedundancyEntry], robot: Robot, name: str) -> RedundancyEntry:
-    """Return the entry of a joint. An entry for this robot takes precedence over an entry for
-    either robot."""
+    """Return the entry of a robot's joint; an empty entry if the file has none.
+
+    An entry 'robot/joint' takes precedence over an entry with the joint's name alone.
+    """
     by_name = {entry.joint: entry for entry in reversed(entries)}
     nothing = RedundancyEntry("", name)
     return by_name.get(f"{robot.name}/{name}", by_name.get(name, nothing))
@@ -407,17 +445,21 @@ class PosturePath:
     """Path of an arm's joints along the hand-made trajectory.
 
     Attributes:
-        q: (n, joints) joint positions at poses evenly spaced along the path parameter, ends
-            included [rad or m].
-        jacobian: (n, 6, joints) Jacobian of the flange at these poses.
+        q: (n, joints) joint positions at n poses, which are evenly spaced along the path parameter
+            and include both ends [rad or m].
+        jacobian: (n, 6, joints) Jacobian of the flange at these poses, along the axes of the root.
     """
 
     q: Array
     jacobian: Array
 
     def at_waypoints(self, joint: int) -> Array:
-        """Return the positions (n_waypoints,) of a joint at the waypoints [rad or m], rounded to
-        0.001."""
+        """Return the positions (n_waypoints,) of one joint at the waypoints, rounded to 0.001 [rad
+        or m].
+
+        Args:
+            joint: index of the joint.
+        """
         return np.asarray(np.round(self.q[::POSES_PER_PIECE, joint], 3))
 
 
@@ -446,8 +488,9 @@ class _Chain:
         return J
 
     def error(self, q: Array, pose: Array) -> Array:
-        """Compute the error (6,) of the flange from the placement that a box pose requires [m,
-        rad]."""
+        """Compute the error (6,) of the flange at joints q from its placement for a box pose [m,
+        rad].
+        """
         T = self.to_root @ box_placement(self.orientation, pose) @ self.T_box_flange
         pin.framesForwardKinematics(self.model, self.data, q)
         here = self.data.oMf[self.flange]
@@ -455,8 +498,9 @@ class _Chain:
         return np.concatenate([T[:3, 3] - here.translation, turn])
 
     def reach(self, q: Array, pose: Array) -> Array | None:
-        """Find a posture near q that holds the box within the joint limits; None if there is
-        none."""
+        """Find joints near q that hold the box at a pose (6,), within the limits; None if none is
+        found.
+        """
         for _ in range(MAX_NEWTON_STEPS):
             error = self.error(q, pose)
             if np.linalg.norm(error) < CLOSE and self.within(q):

@@ -63,7 +63,7 @@ class UrdfCollision:
 
     Attributes:
         shape: the shape.
-        pose: (4, 4) in the link's frame.
+        pose: (4, 4) pose of the shape in the link's frame.
     """
 
     shape: Box | Cylinder | Sphere | Capsule | UrdfMesh
@@ -137,7 +137,11 @@ def read_urdf(path: Path, arguments: Arguments = (), package_dirs: Sequence[Path
 
 @lru_cache(maxsize=8)
 def parse_urdf(content: bytes, file: str) -> Urdf:
-    """Parse the records of a URDF's content; `file` names it in messages.
+    """Parse the content of a URDF file.
+
+    Args:
+        content: content of the file.
+        file: name of the file, for messages.
 
     Raises:
         UrdfError: the content is not XML in UTF-8, or an element is wrong.
@@ -315,7 +319,7 @@ def _joint(joint: ElementReader) -> UrdfJoint:
 
 
 def pose_of(part: ElementReader) -> Array:
-    """Read the origin (4, 4) of an element; the identity if it has none."""
+    """Read the origin of an element as a pose (4, 4); the identity if the element has none."""
     origin = part.child("origin")
     if origin is None:
         return read_only(np.eye(4))
@@ -380,9 +384,10 @@ def _mimic_problem(joints: Mapping[str, UrdfJoint]) -> tuple[str, str] | None:
 
 
 def read_srdf(path: Path) -> tuple[IgnoredPair, ...]:
-    """Read the `disable_collisions` elements of an SRDF file, in its order; ignore the rest.
+    """Read the pairs of links in the `disable_collisions` elements of an SRDF file, in order.
 
-    Each is a pair of links with a reason from the file, such as 'Adjacent' or 'Never', or without.
+    Each pair has the reason that the file states, such as 'Adjacent' or 'Never', or ''. The rest of
+    the file is ignored.
 
     Raises:
         UrdfError: the file cannot be read, is not XML, or such an element lacks a link.
