@@ -1,11 +1,14 @@
-"""The library. `import hybrid_opt as ho` and work with a cell; docs/reference/library.md shows how.
+"""Library for the planning of dual-arm carries. `import hybrid_opt as ho` and work with a `Cell`;
+docs/reference/library.md shows how.
 
-`Cell` is the only resource. `search` and `polish` make a `Front`, a front gives a `Carry`,
-`time_path` makes a `Timing` of it, `recommend` says which to run, `plan_job` plans the whole job
-around that, and `export` writes it for robots. `propose` makes the file of a cell that has no carry
-yet. Rooms, in the order of the data: evaluate, collision, proposing, metaheuristics, indicators,
-polishing, timing, robust, recommending, job, bundles, store; work and campaign carry out whole
-studies; display is how objects look in a notebook.
+`search` and `polish` return a `Front` of a cell, and an entry of a front is a `Carry`. `time_path`
+computes a `Timing` of a carry's path. `recommend` says which carry to run, `plan_job` plans the
+whole job around it, and `export` writes the job for robots. `propose` writes the workcell file of a
+cell that has no carry yet.
+
+Subpackages, in the order in which data pass them: evaluate, collision, proposing, metaheuristics,
+indicators, polishing, timing, robust, recommending, job, bundles, store. work and campaign carry
+out whole studies; display formats objects for terminals and notebooks.
 
 Names are imported when they are first used, so that `import hybrid_opt` takes no time.
 """

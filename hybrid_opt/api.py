@@ -72,18 +72,18 @@ def polish(
 ) -> Front:
     """Improve the carries of a front by nonlinear programming and return the polished front.
 
-    The polish lowers both peak normal forces. In drivable cells, path and speed profile are
-    optimised together.
+    The polish lowers both peak normal forces. In drivable cells it lowers duration and force
+    instead, by optimising path and speed profile together.
 
     Args:
         front: the front to improve.
         rng: random generator that perturbs the starts of some attempts.
         settings: settings of the polish, None for the defaults of the cell's time law.
-        paths: good carries of the same cell as additional starts, or their decision vectors
-            (n_var,), or (n_path,) without the force limit. Only drivable cells take them. No
+        paths: further good carries of the same cell from which attempts start, or their decision
+            vectors (n_var,), or (n_path,) without the force limit; only for drivable cells. No
             given path dominates a point of the result. The hand-made path is always a start.
-        progress: True for a progress bar, or a function that is called with the number of
-            attempts done and the number expected in all; the second number may change.
+        progress: True for a progress bar, or a function that is called with the number of attempts
+            done and the number expected in all; the second number may change.
 
     Raises:
         SettingsError: the cell's objectives are not those of the polish, or a path does not fit.

@@ -1,12 +1,14 @@
-"""Choice of a cell's start branches: pairs of branches compete for evaluations.
+"""Choice of a cell's start branches: pairs of branches, one for each arm, compete for evaluations.
 
-Successive halving (Karnin, Koren and Somekh, ICML 2013): in every round all pairs that are left get
-the same number of evaluations, and the better half goes on. A pair is as good as the hypervolume of
-the carries that it found so far; while it has none, as the least penalty. The rounds of a pair are
-one search: each begins with the best that the pair knows.
+The competition is successive halving (Karnin, Koren and Somekh, ICML 2013): in every round all
+remaining pairs get the same number of evaluations, and the better half of them remains. A pair is
+ranked by the hypervolume of the carries that it has found so far; a pair without a feasible carry,
+by its least penalised objectives. All rounds of a pair form one search: each round begins with the
+pair's best candidates.
 
-In drivable cells pairs compete by the carries that the same paths make from rest to rest
-under 'ramped': what arms reach and hit does not depend on the law, and that one is judged in lanes.
+In drivable cells pairs are compared under the time law 'ramped', from rest to rest. Which obstacles
+the arms hit and what they reach does not depend on the time law, and 'ramped' candidates are
+evaluated faster, several at a time.
 """
 
 from __future__ import annotations
@@ -48,16 +50,16 @@ _HOLDING = [
 
 @dataclass(frozen=True)
 class PairResult:
-    """Result of a pair of start branches, one for each robot.
+    """Result of one pair of start branches, one branch for each robot.
 
     Attributes:
-        branches: index of each robot's branch in the ranked list of its branches.
+        branches: for each robot, index of its branch in the ranked list of its branches.
         rounds: number of rounds in which the pair took part; 0 if the arms could follow none of the
-            trajectories tried.
+            trajectories that were tried before the first round.
         evaluations: number of candidates evaluated with the pair.
         feasible_share: share of these candidates that are feasible.
-        hypervolume: hypervolume of the front of these candidates.
-        least_penalty: least mean of the penalised objectives over these candidates.
+        hypervolume: hypervolume of the front of these candidates; 0 if none is feasible.
+        least_penalty: mean over the penalised objectives, the least of these candidates.
     """
 
     branches: tuple[int, int]
@@ -73,10 +75,10 @@ class BranchCompetition:
     """Result of a competition between pairs of start branches.
 
     Attributes:
-        pairs: results of all pairs, the best first: sorted by rounds, then hypervolume, then
-            penalty.
+        pairs: results of all pairs, the best first: sorted by number of rounds, then hypervolume,
+            then least penalised objectives.
         evaluations: number of candidates evaluated with all pairs together.
-        law: name of the time law of the evaluations.
+        law: name of the time law under which candidates were evaluated.
     """
 
     pairs: tuple[PairResult, ...]
@@ -85,7 +87,7 @@ class BranchCompetition:
 
     @property
     def winner(self) -> tuple[int, int]:
-        """Indices of both robots' branches in the best pair."""
+        """(2,) index of each robot's branch in the best pair, as in `PairResult.branches`."""
         return self.pairs[0].branches
 
     def __str__(self) -> str:
@@ -111,7 +113,7 @@ class BranchCompetition:
 
 
 class _Pair:
-    """A pair of start branches, and all candidates evaluated with it so far."""
+    """A pair of start branches, with all candidates evaluated so far."""
 
     def __init__(self, branches: tuple[int, int], evaluator: CandidateEvaluator) -> None:
         self.branches, self.evaluator = branches, evaluator
@@ -119,7 +121,13 @@ class _Pair:
         self._parts: list[Evaluations] = []
 
     def search(self, algorithm: str, evaluations: int, rng: np.random.Generator) -> None:
-        """Run one more round: a search that starts with the best candidates so far."""
+        """Run one more round of the pair: a search that starts with its best candidates so far.
+
+        Args:
+            algorithm: name of the search algorithm.
+            evaluations: number of candidates to evaluate.
+            rng: random generator.
+        """
         known = concatenated(self._parts)
         order = np.argsort(known.penalised.mean(axis=1), kind="stable")
         settings = SearchSettings(initial=known.x[order[: min(BEST, evaluations)]])
@@ -128,7 +136,9 @@ class _Pair:
         self.rounds += 1
 
     def try_out(self, x: Array) -> bool:
-        """Return True if both arms can follow at least one of the candidates (n, n_var)."""
+        """Evaluate candidates x (n, n_var) and return True if both arms can follow at least one of
+        them.
+        """
         found = self.evaluator.evaluate(x)
         self._parts.append(found)
         return bool(np.any(np.all(found.violation[:, _HOLDING] <= 0.0, axis=1)))
@@ -156,10 +166,11 @@ def search_branches(
     algorithm: str = "nsga2",
     progress: ShowProgress = False,
 ) -> BranchCompetition:
-    """Find the best pair of start branches by a competition. Pairs take part with which both arms
-    can follow the hand-made trajectory or one of some random ones.
+    """Find the best pair of start branches, one for each arm, by a competition.
 
-    For a robot whose `start_branch` in the workcell file is a number, only this branch takes part.
+    A pair takes part if the arms can follow the hand-made trajectory, or one of some random
+    trajectories, with it. If a robot's `start_branch` in the workcell file is a number, only this
+    branch of the robot takes part.
 
     Args:
         cell: the cell.
@@ -173,7 +184,7 @@ def search_branches(
     Raises:
         SettingsError: candidates of this cell cannot be evaluated with other start branches, or the
             cell does not have two objectives.
-        WorkcellError: with no pair the arms can follow any trajectory tried.
+        WorkcellError: the arms cannot follow any tried trajectory with any pair.
     """
     if cell.workcell.task.law.is_drivable:
         cell = _from_rest_to_rest(cell)

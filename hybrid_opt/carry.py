@@ -1,9 +1,9 @@
 """One carry: motion of box and arms, and the forces between them, under one timing.
 
 `Cell.carry` returns a carry under the task's time law. `time_path` returns a timing within the
-limits of the robots, which also contains a carry. Exports sample a carry at even time steps.
-Forces have an axis over the two robots. Joint quantities are in `arms`, because the arms may have
-different numbers of joints.
+limits of the robots, which contains a carry as well. Arrays of forces have an axis over the two
+robots. Joint arrays are kept per arm in `arms`, because the arms may have different numbers of
+joints.
 """
 
 from __future__ import annotations
@@ -47,8 +47,10 @@ class Judgement:
 
     Attributes:
         feasible: True if the candidate satisfies every constraint.
-        reason: name of the constraint violated first along the path, '' for a feasible candidate.
-        position: path parameter in [0, 1] of the first violation, None without a violation.
+        reason: name of the constraint that is violated first along the path; '' if the candidate is
+            feasible.
+        position: path parameter in [0, 1] of the first violation; None if the candidate is
+            feasible.
         objectives: objective values by name, without penalty.
     """
 
@@ -157,21 +159,25 @@ class Carry(Displayable):
 
     @property
     def force_ratio(self) -> Array:
-        """(2,) peak normal forces over the reference forces, the paper's objectives (Eq. 60)."""
+        """(2,) ratio of each robot's peak normal force to its reference force: the paper's
+        objectives (Eq. 60).
+        """
         return np.asarray(self.peak_normal_force / self.workcell.task.reference_force)
 
     @property
     def peak_resultant_force(self) -> Array:
-        """(2,) largest magnitude of each robot's whole force [N]."""
+        """(2,) largest magnitude of each robot's contact force [N], its normal and tangential part
+        together.
+        """
         return np.asarray(np.linalg.norm(self.contact_force, axis=2).max(axis=0))
 
     @property
     def payload_limit(self) -> float:
-        """Least payload mass at which a robot's force reaches its reference force on the same
-        motion [kg].
+        """Payload mass [kg] at which the first of the robots reaches its reference force on the
+        same motion.
 
-        All forces grow in proportion to the mass. The force of a pad is the magnitude of its
-        contact force, friction included; the force of hands that grip on their own is their normal
+        All forces grow in proportion to the mass. The limited force of a pad is the magnitude of
+        its contact force, friction included; for hands that grip on their own it is the normal
         force.
         """
         forces = self.peak_normal_force, self.peak_resultant_force
@@ -179,18 +185,24 @@ class Carry(Displayable):
 
     @property
     def excess_above_static(self) -> Array:
-        """(2,) excess of the peak normal forces over the forces of the static hold [%]."""
+        """(2,) relative excess of each robot's peak normal force over its normal force when the
+        payload is held level and at rest [%].
+        """
         return excess_above_static(self.peak_normal_force, static_hold(self.workcell).normal_force)
 
     @property
     def mean_excess_above_static(self) -> float:
-        """Excess of the mean of both peak normal forces over the mean of the static hold [%]."""
+        """Relative excess of the mean of both peak normal forces over the mean of both normal
+        forces when the payload is held level and at rest [%].
+        """
         still = static_hold(self.workcell).normal_force.mean()
         return float(excess_above_static(self.peak_normal_force.mean(), still))
 
     @property
     def friction_margin(self) -> Array:
-        """(n, 2) friction left at each contact, mu N - F_t [N]; zero where a cone is tight."""
+        """(n, 2) friction left at each contact [N]: friction coefficient times normal force, less
+        the tangential force; zero where the contact force is on the friction cone.
+        """
         friction = [contact.friction for contact in self.workcell.contacts]
         return np.asarray(self.normal_force * friction - self.tangential_force)
 
@@ -221,7 +233,9 @@ class Carry(Displayable):
 
     @property
     def torque(self) -> Array:
-        """(n, all joints) whole joint torques, both arms side by side [N m]."""
+        """(n, all joints) joint torques of arm motion, weight and contact wrench together, both
+        arms side by side [N m].
+        """
         return self.stack_arms("torque")
 
     def stack_arms(self, name: str) -> Array:
@@ -268,7 +282,9 @@ class Carry(Displayable):
 
 
 def joints_of(workcell: Workcell, values: Array) -> tuple[Array, Array]:
-    """Split joint values of both arms (n, all joints) into one array (n, n_joints) per arm."""
+    """Split joint values of both arms side by side (n, all joints) into one array (n, n_joints) per
+    arm.
+    """
     first = len(workcell.robots[0].velocity_max)
     return values[:, :first], values[:, first:]
 
@@ -334,11 +350,18 @@ def _arm(
 def _joint_rates(
     workcell: Workcell, x: Array, q: Array, outputs: Mapping[str, Array]
 ) -> tuple[Array, Array]:
-    """Compute the first and second time derivatives of joints q (n, n_joints).
+    """Compute the first and second time derivative of one arm's joint positions.
 
-    Under 'constant' they are second-order finite differences on the law's times, as the paper
-    takes the box's (one-sided at the ends). Under 'ramped' the law's own u' and u'' drive the
-    joints' finite differences over u, so that an arm rests wherever the box does.
+    Under the time law 'constant' they are second-order finite differences over the time of the
+    samples, one-sided at the ends, as the paper differentiates the box pose. Under 'ramped' they
+    are finite differences over the path parameter u, combined with the law's own u' and u'': so the
+    arm rests wherever the box rests.
+
+    Args:
+        workcell: the description of the cell.
+        x: (n_var,) decision vector.
+        q: (n, n_joints) joint positions [rad].
+        outputs: output arrays of the compiled candidate function by name.
     """
     if workcell.task.law.has_differences:
         time = outputs["time"].reshape(-1)

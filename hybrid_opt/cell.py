@@ -1,6 +1,7 @@
-"""A dual-arm cell: its description, and its compiled functions on demand.
+"""A dual-arm cell: its description, and its compiled functions, which are loaded when they are
+needed.
 
-The only resource of the library. Everything it computes is returned as a frozen record.
+`Cell` is the only class of the library that holds resources. All its results are frozen records.
 """
 
 from __future__ import annotations
@@ -92,7 +93,7 @@ class Cell:
         self._polishers: dict[PolishSettings, Polisher] = {}
 
     def __reduce__(self) -> tuple[type[Cell], tuple[Any, ...]]:
-        """Pickle the description: another process loads its functions anew."""
+        """Describe the cell for pickling without its functions; another process loads them anew."""
         return Cell, (self.workcell, self._objectives, self._threads)
 
     @classmethod
@@ -102,7 +103,13 @@ class Cell:
         objectives: Sequence[str | Objective] = PAPER_OBJECTIVES,
         threads: int | None = None,
     ) -> Cell:
-        """Load the cell of a workcell file.
+        """Return the cell of a workcell file.
+
+        Args:
+            path: path of the workcell file.
+            objectives: objectives that searches minimise: names in `OBJECTIVES`, or `Objective`
+                records.
+            threads: number of threads that evaluate candidates, as in the constructor.
 
         Raises:
             WorkcellError: the file is wrong; the message lists every problem.
@@ -118,8 +125,14 @@ class Cell:
         objectives: Sequence[str | Objective] = PAPER_OBJECTIVES,
         threads: int | None = None,
     ) -> Cell:
-        """Open the cell of a workcell's files, in a temporary folder that lasts as long as the
-        cell.
+        """Return the cell of a workcell's files in memory, which are unpacked to a temporary
+        folder. The folder lasts as long as the cell.
+
+        Args:
+            files: content of the workcell file and of the files that it names.
+            objectives: objectives that searches minimise: names in `OBJECTIVES`, or `Objective`
+                records.
+            threads: number of threads that evaluate candidates, as in the constructor.
 
         Raises:
             SettingsError: an objective is unknown, or given twice.
@@ -130,11 +143,10 @@ class Cell:
         return cell
 
     def with_start_branches(self, branches: tuple[int, int]) -> Cell:
-        """Read the workcell file again and return the cell with given start branches.
+        """Return a cell with other start branches, after reading the workcell file again.
 
         Args:
-            branches: for each arm, the number of the start branch that replaces "search" in the
-                file.
+            branches: for each arm, index of its start branch, which replaces "search" in the file.
 
         Raises:
             WorkcellError: the file was changed and is wrong now.
@@ -165,12 +177,13 @@ class Cell:
     def drivable(self) -> Cell:
         """Return the drivable variant of the cell (docs/explanation/timing.md).
 
-        Carries of this variant have their fastest timing. The objectives are duration and peak
-        force, or peak robust force if this cell minimises robust forces. The new workcell file
-        lies in a temporary folder that lasts as long as the cell.
+        Carries of this variant have their fastest timing. The objectives are the duration and the
+        peak force; the force is the robust force if this cell minimises robust forces, else the
+        planned force. The new workcell file lies in a temporary folder that lasts as long as the
+        cell.
 
         Raises:
-            BundleError: the workcell file cannot be changed, or was since it was read.
+            BundleError: the workcell file cannot be changed, or was changed since it was read.
             SettingsError: an objective is unknown.
         """
         files = drivable_files(collect_cell(self.workcell))
@@ -178,7 +191,7 @@ class Cell:
 
     @property
     def threads(self) -> int:
-        """Threads that evaluate candidates, 0 for one per core."""
+        """Number of threads that evaluate candidates, 0 for one per core."""
         if self._threads is not None:
             return self._threads
         return 0 if parent_process() is None else 1
@@ -235,7 +248,9 @@ class Cell:
 
     @cached_property
     def grip_budget(self) -> GripBudget:
-        """Commanded force that holds the payload at rest, compared with the reference force."""
+        """Normal forces that hold the payload at rest in every case of the uncertainty, compared
+        with the reference forces.
+        """
         from hybrid_opt.robust.budget import grip_budget
 
         return grip_budget(self.workcell)
@@ -264,7 +279,8 @@ class Cell:
 
     @cached_property
     def holding_evaluator(self) -> CandidateEvaluator:
-        """Evaluator of candidates, after a check that the payload can be held at rest.
+        """Evaluator of candidates, as `evaluator`, after a check that the payload can be held at
+        rest.
 
         Raises:
             WorkcellError: the payload cannot be held at rest.
@@ -279,9 +295,9 @@ class Cell:
 
     @cached_property
     def force_kind(self) -> ForceKind:
-        """Kind of force that the limits of drivable carries bound.
+        """Kind of force that force limits of drivable carries bound.
 
-        The limits bound robust forces if the objectives contain robust forces, else planned ones.
+        It is the robust force if the objectives contain robust forces, else the planned force.
 
         Raises:
             SettingsError: an objective is unknown.
@@ -315,7 +331,7 @@ class Cell:
 
     @cached_property
     def initial(self) -> Array:
-        """(n_var,) decision vector of the workcell file's hand-made trajectory; read-only."""
+        """(n_var,) decision vector of the hand-made trajectory in the workcell file; read-only."""
         return read_only(initial_decision(self.workcell.task))
 
     def evaluate(self, x: Array) -> Evaluations:
@@ -336,14 +352,20 @@ class Cell:
     def random(self, count: int, rng: np.random.Generator) -> Array:
         """Draw random decision vectors (count, n_var).
 
-        The waypoints that the workcell file states are drawn uniformly within their bounds.
+        The waypoints of the workcell file are drawn uniformly within their bounds. If the cell has
+        further waypoints, these follow from the drawn ones.
+
+        Args:
+            count: number of decision vectors.
+            rng: random generator.
         """
         task, drawn = self.workcell.task, coarse_task(self.workcell.task)
         x = rng.uniform(drawn.lower, drawn.upper, (count, drawn.n_var))
         return resample_decisions(x, drawn, task)
 
     def carry(self, x: Array) -> Carry:
-        """Evaluate one decision vector (n_var,) in detail, under the task's time law.
+        """Compute every physical quantity of the carry of one decision vector (n_var,), under the
+        task's time law.
 
         Raises:
             SettingsError: x has the wrong shape.

@@ -39,7 +39,8 @@ Environment = Mapping[str, str]
 
 
 class DaskWorkers(Workers):
-    """Makes calls on the workers of a Dask cluster. Dask repeats the calls of a lost worker.
+    """Workers of a Dask cluster that call functions in parallel. Dask repeats the calls of a lost
+    worker.
 
     The workers need this package and its dependencies in the same versions, and a C compiler.
     """
@@ -84,7 +85,7 @@ class DaskWorkers(Workers):
                 self._give_up("does not answer any more")
 
     def close(self) -> None:
-        """Disconnect; unfinished calls are cancelled."""
+        """Disconnect from the cluster and cancel unfinished calls."""
         with self._resources:
             self._client = None
 
@@ -152,8 +153,9 @@ def _require_address(address: str) -> None:
 
 @contextmanager
 def _without_tracebacks() -> Iterator[None]:
-    """Keep Dask from logging tracebacks of a lost connection inside the `with` block; this project
-    reports the loss by an error of its own."""
+    """Suppress Dask's log of tracebacks inside the `with` block when the connection is lost; this
+    project reports the loss by its own error.
+    """
     loggers = [logging.getLogger(name) for name in ("distributed", "distributed.client")]
     levels = [logger.level for logger in loggers]
     try:
@@ -171,8 +173,13 @@ def _call(
     function: Callable[[Argument], Result],
     argument: Argument,
 ) -> Result:
-    """Call a function on a worker, after a check that the worker's software equals the `wanted`
-    description.
+    """Call a function on a worker, after a check of the worker's software.
+
+    Args:
+        environment: function that describes the software of the process in which it is called.
+        wanted: description that the worker's software has to equal.
+        function: function of one argument.
+        argument: the argument.
 
     Raises:
         DualArmError: the software differs.

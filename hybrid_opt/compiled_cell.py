@@ -35,8 +35,8 @@ class CompiledCell:
     """Compiled functions of a workcell, built in sets on first use. Share one object wherever
     several sets are needed.
 
-    A set that was built before, also by another process, is loaded from the cache, without a
-    symbolic model. Otherwise it is built from the model, which is made once.
+    A set that was built before, also by another process, is loaded from the cache without the
+    symbolic model. Otherwise it is built from the symbolic model, which is made once.
 
     Attributes:
         workcell: description of the cell.
@@ -69,15 +69,21 @@ class CompiledCell:
         self._loaded: dict[object, Any] = {}
 
     def with_parameters(self, workcell: Workcell) -> CompiledCell:
-        """Return the functions of a workcell with other parameters, which share the loaded
-        libraries."""
+        """Return the compiled functions of another workcell, which differs only in parameters. Both
+        objects share the loaded libraries.
+        """
         other = CompiledCell(workcell, self.cache)
         other._loaded, other._is_changed = self._loaded, True
         return other
 
     def memoise(self, key: object, load: Callable[[], Loaded]) -> Loaded:
-        """Return the value cached under `key`, or load it. Cells made by `with_parameters` share
-        the cache."""
+        """Return the object stored under a key in memory; call `load` and store its result if there
+        is none. Objects made by `with_parameters` share the store.
+
+        Args:
+            key: key of the object, which has to be hashable.
+            load: function that makes the object.
+        """
         if key not in self._loaded:
             self._loaded[key] = load()
         found: Loaded = self._loaded[key]
@@ -103,7 +109,9 @@ class CompiledCell:
         return build_cell_model(self.workcell, self.bodies, self._searches())
 
     def _searches(self) -> tuple[ArmSearch, ArmSearch] | None:
-        """Return the compiled searches for start branches; None for CasADi's interpreter."""
+        """Return for each arm the search for start branches in compiled functions. An
+        `InterpretedCell` returns None.
+        """
         from symbolic.cell_model import own_clearance
         from symbolic.robot.branches import ArmSearch
 
@@ -149,7 +157,7 @@ class CompiledCell:
 
     @property
     def geometry(self) -> CellGeometry:
-        """The collision bodies, and the pairs of them that are checked."""
+        """Collision bodies of the cell, and the pairs of bodies that are checked for collision."""
         return self.bodies.geometry
 
     @cached_property
@@ -162,12 +170,12 @@ class CompiledCell:
 
     @cached_property
     def symbols(self) -> CellModel:
-        """The symbolic model whose functions take the parameters as inputs."""
+        """Symbolic model of the cell, whose functions take the cell's parameters as inputs."""
         return self.numbers.symbolic(self.bodies)
 
     @cached_property
     def start(self) -> tuple[Array, Array]:
-        """(n,) joint positions of each arm at the first waypoint [rad].
+        """(n_joints,) joint positions of each arm at the first waypoint [rad].
 
         Raises:
             DualArmError: the model cannot be built.
@@ -198,20 +206,25 @@ class CompiledCell:
         return self.memoise(key, find)
 
     def vector(self, group: str) -> Array:
-        """Return the values (n,) of a group of parameters, see `symbolic.parameters`."""
+        """Return the values (n,) of one group of parameters.
+
+        Args:
+            group: name of the group, one of `symbolic.parameters.GROUPS`.
+        """
         from symbolic.parameters import START
 
         return np.concatenate(self.start) if group == START else self.numbers.vector(group)
 
     def key(self, name: str, *details: str, bodies: bool = True) -> str:
-        """Return the key under which a set of functions is cached. It depends on the topology of
-        the cell and on the code that makes the expressions; the version of CasADi is added for
-        every set.
+        """Return the key under which a set of functions is cached.
+
+        The key depends on the topology of the cell and on the source code that makes the
+        expressions. The cache adds the version of CasADi.
 
         Args:
             name: name of the set.
             details: further values on which the functions depend.
-            bodies: whether the set depends on the collision bodies.
+            bodies: True if the functions depend on the collision bodies.
         """
         numbers = self.numbers
         return key_of(
@@ -232,16 +245,20 @@ class CompiledCell:
         bodies: bool = True,
         taped: bool = False,
     ) -> dict[str, NumericFunction]:
-        """Return a set of functions with this cell's parameters, from the cache if one of the same
-        topology was built before.
+        """Return a set of compiled functions by name, with the parameters of this cell filled in.
+
+        The set is loaded from the cache if it was built before for a cell of the same topology.
 
         Args:
-            name: of the set.
-            make: makes the functions from the model with symbols.
-            details: further ingredients of `make`.
-            lanes, levels: see `codegen.build.build`.
-            bodies: whether it depends on the bodies.
-            taped: see `codegen.build.load_or_build`.
+            name: name of the set.
+            make: function that makes the CasADi functions from the symbolic model `symbols`.
+            details: further values on which the functions depend.
+            lanes: number of evaluations of a batch that run side by side; 0 for the machine's
+                width.
+            levels: optimisation levels of the compiler by name of the function; the size of the C
+                text decides the others.
+            bodies: True if the functions depend on the collision bodies.
+            taped: True to store functions over SX as tapes and compile only the others.
 
         Raises:
             DualArmError: the model or its code cannot be built.
@@ -256,7 +273,7 @@ class CompiledCell:
         return {name: self.bound(function) for name, function in built.items()}
 
     def bound(self, function: NumericFunction) -> NumericFunction:
-        """Return a function with this cell's parameters as its last inputs."""
+        """Return a function whose last inputs, the parameters, are filled in from this cell."""
         from symbolic.parameters import GROUPS
 
         return function.bound(
@@ -288,8 +305,8 @@ class CompiledCell:
 class InterpretedCell(CompiledCell):
     """Functions of a workcell that CasADi's interpreter evaluates; nothing is compiled.
 
-    It is meant for a few hundred evaluations: one takes fifty times as long, but compiling the sets
-    of a new cell takes a minute.
+    It suits a few hundred evaluations. One evaluation takes fifty times as long as a compiled one,
+    but compiling the functions of a new cell takes a minute.
     """
 
     is_compiled = False
@@ -299,7 +316,7 @@ class InterpretedCell(CompiledCell):
 
     @cached_property
     def start(self) -> tuple[Array, Array]:
-        """(n,) joint positions of each arm at the first waypoint [rad]."""
+        """(n_joints,) joint positions of each arm at the first waypoint [rad]."""
         return self.model.start
 
     def functions(
@@ -309,26 +326,40 @@ class InterpretedCell(CompiledCell):
         *details: str,
         **choices: Any,
     ) -> dict[str, NumericFunction]:
-        """Return a set of functions of this cell, made from its symbolic model."""
+        """Return a set of interpreted functions of this cell by name.
+
+        Args:
+            name: ignored, as `details` and `choices` are: nothing is cached.
+            make: function that makes the CasADi functions from the symbolic model.
+            details: ignored.
+            choices: ignored.
+        """
         from codegen.interpreted import interpret
 
         return {name: interpret(function) for name, function in make(self.model).items()}
 
 
 def is_interpretable(workcell: Workcell) -> bool:
-    """Return True if CasADi's interpreter evaluates a candidate in milliseconds, because forces
-    have a closed form and candidates are not timed by compiled code."""
+    """Return True if CasADi's interpreter evaluates a candidate in milliseconds.
+
+    It does if the contact forces have a closed form and the time law is not drivable.
+    """
     return contact_model(workcell).has_closed_form and not workcell.task.law.is_drivable
 
 
 @lru_cache
 def _expressions(folder: Path) -> str:
-    """Return the digest of the source code of `symbolic` at the first call of this process."""
+    """Return the digest of the source code of the package `symbolic`, as it was at the first call
+    in this process.
+
+    Args:
+        folder: folder of the cache of compiled libraries.
+    """
     return Cache(folder).code_digest("symbolic")
 
 
 class _Identity:
-    """A workcell that equals only itself, as a key of a cache."""
+    """Key of a cache for one workcell object; two keys are equal if they hold the same object."""
 
     def __init__(self, workcell: Workcell) -> None:
         self.workcell = workcell
@@ -341,8 +372,9 @@ class _Identity:
 
 
 def cache_by_workcell(build: Callable[[Workcell], Loaded]) -> Callable[[Workcell], Loaded]:
-    """Return a function that caches its results for the last workcells, which are compared by
-    identity."""
+    """Return a function that calls `build` once per workcell and caches the results of the last few
+    workcells. Workcells are compared by identity, not by value.
+    """
 
     @lru_cache(maxsize=CACHED_WORKCELLS)
     def kept(identity: _Identity) -> Loaded:
@@ -365,7 +397,13 @@ _held_numbers = cache_by_workcell(_numbers)
 
 
 def bound_to(function: NumericFunction, numbers: WorkcellParameters) -> NumericFunction:
-    """Return a function with a cell's parameters, except start postures, as its last inputs."""
+    """Return a function whose last inputs, the parameters, are filled in with a cell's parameters,
+    except start postures.
+
+    Args:
+        function: the function.
+        numbers: parameters of the cell.
+    """
     names = [name for name in function.input_names if name in numbers.sizes]
     return function.bound({name: numbers.vector(name) for name in names})
 
@@ -380,16 +418,20 @@ def contact_function(
     make: Callable[[Workcell], ca.Function],
     lanes: int = 1,
 ) -> NumericFunction:
-    """Return a function of payload and contacts with a cell's parameters, from the cache if one of
-    the same topology was built before. Arms and bodies are not read.
+    """Return a compiled function of payload and contacts, with the parameters of a workcell filled
+    in.
+
+    The function is loaded from the cache if it was built before for a cell of the same topology.
+    Arms and collision bodies are not read.
 
     Args:
-        name: in the cache.
-        make: makes it from the cell with symbols.
-        lanes: see `codegen.build.build`.
+        workcell: the cell.
+        name: name of the function in the cache.
+        make: function that makes the CasADi function from a workcell whose parameters are symbols.
+        lanes: number of evaluations of a batch that run side by side; 0 for the machine's width.
 
     Raises:
-        DualArmError: its code cannot be built.
+        DualArmError: the code of the function cannot be built.
     """
     numbers, cache = _held_numbers(workcell), Cache()
     key = key_of(

@@ -1,9 +1,11 @@
-"""Fronts (non-dominated feasible carries of a search or polish), and selection of one carry.
+"""Fronts (non-dominated feasible carries of a search or polish), and the choice of one carry of a
+front.
 
-The balanced carry has the least mean of both robots' peak normal forces. Where one robot can
-relieve the other at no cost, a polished front is flat: many points have the same mean to five
-digits. The most even of such points is selected, which leaves most room for payload. Drivable
-fronts reach down to forces at which a carry hardly moves; their knee is selected.
+The balanced carry has the least mean of both robots' peak normal forces. A polished front is flat
+where one robot can relieve the other at no cost: the means of many points agree to five digits. Of
+these points the one with the least larger peak is selected, which leaves most room for payload.
+Drivable fronts include carries that hardly move and need the least force; of a drivable front the
+knee is selected.
 """
 
 from __future__ import annotations
@@ -26,9 +28,10 @@ from symbolic.errors import SettingsError
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Front(Displayable):
-    """Non-dominated feasible carries of a cell, by increasing first objective; read-only arrays.
+    """Non-dominated feasible carries of a cell, by increasing first objective; arrays are
+    read-only.
 
-    Every member is proven free of collisions between the samples too.
+    Every carry is proven free of collisions along its whole path, also between the samples.
 
     Attributes:
         cell: the cell of the carries.
@@ -125,7 +128,8 @@ class Front(Displayable):
     def balanced(self) -> Carry:
         """Return the carry with the least mean of the two robots' peak normal forces.
 
-        Among nearly equal means (`TIE`), the carry with the least larger peak is returned.
+        Of several carries whose means differ by less than `TIE`, the one whose larger peak is least
+        is returned.
 
         Raises:
             SettingsError: the front is empty.
@@ -200,7 +204,8 @@ class SelectedCarry:
     """The carry selected from a front.
 
     Attributes:
-        row: row of the carry in the evaluations of the replica, or in the polished front.
+        row: index of the carry in the evaluations of the replica or, for a polished front, in the
+            front.
         carry: the selected carry under the task's time law, with its judgement.
     """
 
@@ -209,7 +214,7 @@ class SelectedCarry:
 
     @property
     def objectives(self) -> Array:
-        """(n_obj,) objectives of the carry without penalty."""
+        """(n_obj,) objective values of the carry, without penalty."""
         assert self.carry.judgement is not None
         return np.array(list(self.carry.judgement.objectives.values()))
 
@@ -217,7 +222,8 @@ class SelectedCarry:
 def balanced(peak_normal_force: Array) -> int:
     """Return the index of the carry with the least mean of both robots' peak normal forces.
 
-    Among means that differ by less than `TIE`, the carry with the least larger peak is chosen.
+    Of several carries whose means differ by less than `TIE`, the one whose larger peak is least is
+    chosen.
 
     Args:
         peak_normal_force: (k, 2) peak normal force of each robot in k carries [N].
@@ -230,9 +236,10 @@ def balanced(peak_normal_force: Array) -> int:
 def knee(points: Array) -> int:
     """Return the index of the point with the least product of its two objectives.
 
-    Next to the knee, raising one objective by one per cent lowers the other by at most one.
-    The distance from the line between the front's ends (Das 1999) would depend on how far the
-    ends were explored: one long carry at almost the least force moves the knee by a newton.
+    Near this point a rise of one objective by one per cent lowers the other by at most one per
+    cent. The distance from the line between the front's ends (Das 1999) is not used, because it
+    depends on how far the ends were explored: one long carry at almost the least force moves that
+    knee by a newton.
 
     Args:
         points: (k, 2) positive objectives of the points.

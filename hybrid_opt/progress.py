@@ -1,4 +1,6 @@
-"""Progress of work: lines on standard error, a bar, or a function of the caller's."""
+"""Display of the progress of work: as lines on standard error, as a bar, or by a function that the
+caller gives.
+"""
 
 from __future__ import annotations
 
@@ -18,20 +20,24 @@ done and the total."""
 
 
 class Advance(Protocol):
-    """Function that reports progress: it takes the number of further units done, and the total if
-    that has changed."""
+    """Function with which work reports its progress to a display."""
 
     def __call__(self, count: int, total: int | None = None, /) -> None:
-        """Report that `count` further units are done, of `total` in all if that has changed."""
+        """Report further progress.
+
+        Args:
+            count: number of units that were done since the last report.
+            total: new total number of units; None if it has not changed.
+        """
 
 
 @contextmanager
 def progress_bar(progress: ShowProgress, what: str, total: int) -> Iterator[Advance]:
-    """Show the progress of a call inside the `with` block, as the caller chose. Yield the function
-    that reports progress.
+    """Show the progress of a call inside the `with` block, and yield the function that reports it.
 
     Args:
-        progress: how to show it.
+        progress: True for a bar, False for none, or a function of the finished and the total number
+            of units.
         what: text in front of the bar.
         total: number of units in all.
     """
@@ -61,7 +67,12 @@ def progress_bar(progress: ShowProgress, what: str, total: int) -> Iterator[Adva
 
 
 def as_callback(advance: Advance) -> Callable[[int, int], None]:
-    """Return a function of (done, total) that reports to an open progress bar."""
+    """Return a function of the finished and the total number of units that reports to an open
+    display.
+
+    Args:
+        advance: function that reports progress to the display.
+    """
     before = 0
 
     def tell(done: int, total: int) -> None:
@@ -82,9 +93,10 @@ def track(progress: ShowProgress, what: str, items: Sequence[T]) -> Iterator[T]:
     """Yield items and show progress: an item counts as done when the next one is requested.
 
     Args:
-        progress: how to show it.
+        progress: True for a bar, False for none, or a function of the finished and the total number
+            of items.
         what: text in front of the bar.
-        items: the items.
+        items: items to yield.
     """
     with progress_bar(progress, what, len(items)) as advance:
         for item in items:
@@ -97,11 +109,11 @@ _QUIET_SECONDS = 10.0
 
 
 class Progress:
-    """Shows the progress of a program's current stage in one line on standard error.
+    """Display of the progress of a program's current stage, in one line on standard error.
 
     Attributes:
         shown: False to show nothing.
-        of: name in front of the titles of stages.
+        of: text in front of the titles of stages.
     """
 
     def __init__(self, shown: bool = True, of: str = "") -> None:
@@ -112,15 +124,16 @@ class Progress:
     def stage(
         self, title: str, total: int, unit: str, done: int = 0, delay: float = 0.0
     ) -> Iterator[Advance]:
-        """Show a line of progress inside the `with` block. Yield the function that reports
+        """Show a line of progress inside the `with` block, and yield the function that reports
         progress.
 
         Args:
             title: name of the stage.
             total: number of units in all.
             unit: name of the units, as 'replicas'.
-            done: number of units that an earlier attempt finished.
-            delay: time before the line appears, so that short work is not shown [s].
+            done: number of units that were finished before this stage began, as by an interrupted
+                run.
+            delay: time before the line appears, so that short work shows none [s].
         """
         bar = tqdm(
             total=total,

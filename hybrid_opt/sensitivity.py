@@ -1,11 +1,14 @@
-"""Sensitivities of a carry's force and duration to every number of a cell.
+"""Sensitivities of a carry's force and duration to every number of a workcell file.
 
-The path is fixed, and driven by the task's time law or as fast as limits allow. The force is the
-largest commanded one that holds in every case of the cell's uncertainty, as in a recommendation.
-Its derivatives by the inputs of formulas are exact (`hybrid_opt.robust.path_force`), and so are
-those of a time law's duration. Derivatives of the fastest duration follow from the slacks of its
-limits at the same speeds (`hybrid_opt.timing.robustness`). The dependence of these inputs and
-slacks on a number of the file is computed by differences of two neighbouring cells.
+The path is fixed. The box follows it under the task's time law, or as fast as the limits allow. The
+force is the largest commanded force along the carry, which holds the box in every case of the
+cell's uncertainty, as in a recommendation.
+
+The formula of the force has exact derivatives with respect to its inputs
+(`hybrid_opt.robust.path_force`), and so has the duration under a time law. The change of the
+fastest duration follows from the slacks of its limits at unchanged path speeds
+(`hybrid_opt.timing.robustness`). How these inputs and slacks depend on a number of the file is
+computed by differences between two neighbouring cells, in which the number is lower and higher.
 """
 
 from __future__ import annotations
@@ -119,7 +122,7 @@ change."""
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """Effect of one number of the workcell file on a carry.
+    """Effect of one number of the workcell file on a carry's force and duration.
 
     Attributes:
         key: key path in the workcell file, with an index for one entry of an array.
@@ -127,9 +130,11 @@ class Sensitivity:
         unit: unit of the number, as text.
         force: change of the force per unit by which the number rises [N/unit].
         lowered_force: change of the force per unit by which the number falls [N/unit]; it differs
-            from `-force` where the governing case changes.
-        duration, lowered_duration: the same for the duration [s/unit]; None where it cannot be
-            computed.
+            from `-force` where another case of the uncertainty then decides the force.
+        duration: change of the duration per unit by which the number rises [s/unit]; None if it
+            cannot be computed.
+        lowered_duration: change of the duration per unit by which the number falls [s/unit]; None
+            if it cannot be computed.
     """
 
     key: str
@@ -153,11 +158,12 @@ class Sensitivities(Displayable):
 
     Attributes:
         workcell: the cell.
-        force: the largest commanded force that holds in every case of the uncertainty [N].
-        duration: of the carry [s].
+        force: largest commanded force along the carry that holds the box in every case of the
+            uncertainty [N].
+        duration: duration of the carry [s].
         rows: effect of each number, the largest effect of a usual change first.
-        missing: for numbers whose effect, or whose effect on the duration, cannot be computed: the
-            reason by key.
+        missing: for each number whose effect on the force or the duration cannot be computed, the
+            reason, by key.
     """
 
     workcell: Workcell
@@ -177,8 +183,15 @@ class Sensitivities(Displayable):
 
 @dataclass(frozen=True)
 class _Number:
-    """One number of a workcell file. `index` is its position in an array, None for a single number;
-    `whole` is the value of the key, a number or an array."""
+    """One number of a workcell file.
+
+    Attributes:
+        path: key path in the workcell file.
+        index: position of the number in an array, None for a single number.
+        value: value of the number [unit].
+        unit: unit of the number, as text.
+        whole: value of the key in the file, a number or an array.
+    """
 
     path: str
     index: int | None
@@ -208,18 +221,21 @@ class _Number:
 
 def sensitivities(carry: Carry | Timing, *, progress: ShowProgress = False) -> Sensitivities:
     """Compute the derivatives of a carry's force and duration with respect to all numbers of its
-    cell.
+    workcell file.
+
+    For a carry under a time law, the motion follows the law in the changed cell. For a timing, the
+    duration is that of the fastest timing of the path within the same limits in the changed cell;
+    the force is that of the motion with unchanged path speeds.
 
     Args:
         carry: a carry under the time law of its task, or the fastest timing of a path within
-            limits. For a timing, the duration is that of the fastest timing within the same limits
-            in the changed cell; the force is that of the unchanged motion.
+            limits.
         progress: True for a progress bar, or a function that is called with the number of file
             numbers done and their total.
 
     Raises:
         SettingsError: the carry has another timing, the timing limits robust forces or is not the
-            fastest, or the uncertainty leaves no force that holds.
+            fastest, or no force holds the box in every case of the uncertainty.
     """
     drive = _Law(carry) if isinstance(carry, Carry) else _Fastest(carry)
     workcell, ruling = drive.carry.workcell, GoverningForce(drive.carry, LEADER)
@@ -266,7 +282,7 @@ def sensitivities(carry: Carry | Timing, *, progress: ShowProgress = False) -> S
 
 
 class _Law:
-    """A carry under its task's time law, in neighbouring cells."""
+    """Changes of a carry under its task's time law in neighbouring cells."""
 
     def __init__(self, carry: Carry) -> None:
         if carry.timing not in ("constant", "ramped"):
@@ -282,18 +298,28 @@ class _Law:
         return number.section == "task"
 
     def is_compiled_with(self, number: _Number, workcell: Workcell) -> bool:
-        """Return True if the duration in the cell changed by this number needs newly compiled
-        functions."""
+        """Return True if the duration in a cell with another value of this number needs newly
+        compiled functions: never, as the time law is interpreted.
+        """
         return False
 
     def durations(self, number: _Number, low: Workcell, high: Workcell) -> tuple[float, float]:
-        """Return the changes of the duration from the present cell to the one with the higher
-        number, and to the one with the lower number [s]."""
+        """Compute the changes of the duration [s] from the present cell to two neighbouring cells.
+
+        Args:
+            number: the number that differs.
+            low, high: cells with a lower, and an equally much higher, value of the number.
+
+        Returns:
+            Change towards `high`, and change towards `low`.
+        """
         before, after = (float(self._driven(cell)[0][-1, 0]) for cell in (low, high))
         return (after - before) / 2.0, (before - after) / 2.0
 
     def motion(self, workcell: Workcell, samples: NDArray[np.intp]) -> BoxMotion:
-        """Compute the motion in another cell, at the samples with these indices."""
+        """Compute the box motion in another cell at some samples of the carry, given by their
+        indices.
+        """
         return BoxMotion(*[part[samples] for part in self._driven(workcell)[1:]])
 
     def _driven(self, workcell: Workcell) -> list[Array]:
@@ -305,8 +331,11 @@ class _Law:
 
 
 class _Fastest:
-    """The fastest timing of a path, in neighbouring cells. The path speeds are fixed; the change of
-    the duration follows from the ratios to the limits at these speeds."""
+    """Changes of the fastest timing of a path in neighbouring cells.
+
+    The path speeds are fixed. The change of the duration follows from the ratios of all values to
+    their limits at these speeds.
+    """
 
     def __init__(self, timing: Timing) -> None:
         if timing.limits.robust:
@@ -326,15 +355,24 @@ class _Fastest:
         return number.section != "uncertainty"
 
     def is_compiled_with(self, number: _Number, workcell: Workcell) -> bool:
-        """Return True if a cell changed by this number needs newly compiled functions: if an
-        upright base becomes tilted, or if pads whose normals are not opposite move."""
+        """Return True if a cell with another value of this number needs newly compiled functions.
+
+        It does if an upright base becomes tilted, or if pads whose normals are not opposite move.
+        """
         if number.is_limit or not self.moved_by(number):
             return False
         return WorkcellParameters(workcell).digest != self._digest
 
     def durations(self, number: _Number, low: Workcell, high: Workcell) -> tuple[float, float]:
-        """Return the changes of the duration from the present cell to the one with the higher
-        number, and to the one with the lower number [s]."""
+        """Compute the changes of the duration [s] from the present cell to two neighbouring cells.
+
+        Args:
+            number: the number that differs.
+            low, high: cells with a lower, and an equally much higher, value of the number.
+
+        Returns:
+            Change towards `high`, and change towards `low`.
+        """
         before, after = (self._ratios(number, cell) for cell in (low, high))
         return self._near.changes(before, after)
 
@@ -346,7 +384,9 @@ class _Fastest:
         return CarryLimits(workcell).ratios(carry, self._limits)
 
     def motion(self, workcell: Workcell, samples: NDArray[np.intp]) -> BoxMotion:
-        """Compute the motion in another cell, at the samples with these indices."""
+        """Compute the box motion in another cell at some samples of the carry, given by their
+        indices, with unchanged path speeds.
+        """
         points, speeds = waypoints_of(workcell.task, self.carry.x), self._near.speeds
         basis = path_basis(len(points), self.carry.parameter[samples])
         first, second = basis.first @ points, basis.second @ points

@@ -1,6 +1,7 @@
-"""Static hold of the payload: forces, payload limit, and check of all limits at rest.
+"""Static hold: contact forces with the payload at rest, the largest payload that can be held, and a
+check of all limits at rest.
 
-No carry has much smaller forces.
+The forces along a carry are never much smaller than at rest.
 """
 
 from __future__ import annotations
@@ -37,12 +38,14 @@ REMEDY_BISECTIONS = 24
 
 @dataclass(frozen=True)
 class StaticHold:
-    """Forces that hold the payload level and at rest.
+    """Contact forces that hold the payload level and at rest.
 
     Attributes:
         normal_force: (2,) normal force of each robot [N], read-only.
-        contact_force: (2,) magnitude of each robot's whole force [N], read-only.
-        payload_limit: payload at which a robot's whole force reaches its reference force [kg].
+        contact_force: (2,) magnitude of each robot's contact force, normal and tangential together
+            [N], read-only.
+        payload_limit: payload mass at which a robot's contact force reaches its reference force
+            [kg].
     """
 
     normal_force: Pair
@@ -52,10 +55,11 @@ class StaticHold:
 
 @cache_by_workcell
 def static_hold(workcell: Workcell) -> StaticHold:
-    """Compute the forces of the payload held level and still; cached per workcell.
+    """Compute the contact forces that hold the payload level and at rest; cached per workcell.
 
-    With equal friction coefficients mu the normal forces are m g / (2 mu) each, and the whole
-    forces (m g / 2) sqrt(1 + 1 / mu^2).
+    If both pads have the friction coefficient mu, each normal force is m g / (2 mu) and each
+    contact force has the magnitude (m g / 2) sqrt(1 + 1 / mu^2), with m the payload mass and g =
+    9.81 m/s^2.
     """
     outputs = still_load(workcell, np.zeros(6))
     normal = outputs["normal_force"]
@@ -68,10 +72,10 @@ def static_hold(workcell: Workcell) -> StaticHold:
 
 
 def limited_force(workcell: Workcell, normal: Array, whole: Array) -> Array:
-    """Return the forces that the reference forces limit.
+    """Return for each robot the force (2,) [N] that its reference force limits.
 
-    For pads these are the whole contact forces; for hands that grip on their own, the normal
-    forces.
+    For pads it is the magnitude of the contact force, for hands that grip on their own the normal
+    force.
 
     Args:
         workcell: the description of the cell.
@@ -82,24 +86,27 @@ def limited_force(workcell: Workcell, normal: Array, whole: Array) -> Array:
 
 
 def mass_at_reference(workcell: Workcell, force: Array) -> Array:
-    """Compute the payload (2,) [kg] at which a force of each robot reaches its reference force.
+    """Compute for each robot the payload mass (2,) [kg] at which its force reaches its reference
+    force.
 
     Forces along an unchanged motion are proportional to the mass (paper Figure 12).
 
     Args:
         workcell: the cell.
-        force: (2,) peak forces with the workcell's own mass [N].
+        force: (2,) peak force of each robot with the workcell's payload mass [N].
     """
     mass: Array = workcell.payload.mass * (workcell.task.reference_force / force)
     return mass
 
 
 def payload_limit(workcell: Workcell, contact_force: Array) -> float:
-    """Compute the least payload [kg] at which a robot's whole force reaches its reference force.
+    """Compute the least payload mass [kg] at which a robot's contact force reaches its reference
+    force.
 
     Args:
         workcell: the cell.
-        contact_force: (2,) peak magnitudes of the whole forces, with the workcell's own mass [N].
+        contact_force: (2,) peak magnitude of each robot's contact force with the workcell's payload
+            mass [N].
     """
     return float(mass_at_reference(workcell, contact_force).min())
 
@@ -132,13 +139,14 @@ def still_load(
 
 @dataclass(frozen=True)
 class StaticUtilisation:
-    """Needed and allowed value of one limited quantity with the payload at rest.
+    """Needed and allowed value of one limited quantity when the payload is at rest.
 
     Attributes:
         quantity: name of the limited quantity.
-        whose: name of the robot, or robot/joint.
+        whose: name of the robot, or of robot and joint as 'robot/joint'.
         where: end of the path, 'start' or 'goal'.
-        needed, allowed: needed value and limit, in the unit of `unit`.
+        needed: needed value [unit].
+        allowed: limit [unit].
         unit: unit of both values, as text.
     """
 
@@ -151,12 +159,12 @@ class StaticUtilisation:
 
     @property
     def share(self) -> float:
-        """Share of the limit that is needed."""
+        """Ratio of the needed value to the limit."""
         return self.needed / self.allowed
 
     @property
     def exceeded(self) -> bool:
-        """True if the use exceeds the limit."""
+        """True if the needed value exceeds the limit."""
         return self.share > 1.0 + UTILISATION_TOLERANCE
 
     def __str__(self) -> str:
@@ -211,13 +219,27 @@ def require_hold(workcell: Workcell, outputs: Outputs | None = None) -> None:
 
 
 def hold_error(workcell: Workcell, reason: str) -> WorkcellError:
-    """Return the error of a payload that cannot be held at rest, with the reason."""
+    """Return the error, to be raised, of a payload that cannot be held at rest.
+
+    Args:
+        workcell: the cell.
+        reason: reason why the payload cannot be held, with a remedy.
+    """
     return WorkcellError(str(workcell.source), (f"payload: {reason}",))
 
 
 def _ends(workcell: Workcell, outputs: Outputs) -> list[tuple[Array, Array]]:
-    """Return both arms' joint positions at the start and at the goal of the hand-made trajectory;
-    nothing for an end that the arms do not reach."""
+    """Return the joint positions of both arms at the start and at the goal of the hand-made
+    trajectory.
+
+    Args:
+        workcell: the cell.
+        outputs: `CandidateEvaluator.outputs`.
+
+    Returns:
+        Joint positions (n_joints,) of each arm [rad or m] at start and goal; an end that an arm
+            does not reach is left out.
+    """
     found = outputs(initial_decision(workcell.task)[None])
     return [
         (found["q_1"][0, sample], found["q_2"][0, sample])
@@ -227,7 +249,7 @@ def _ends(workcell: Workcell, outputs: Outputs) -> list[tuple[Array, Array]]:
 
 
 class _Still:
-    """A payload at rest at both ends of its path, with scaled mass and friction."""
+    """Check of the payload at rest at start and goal, for scaled payload mass and friction."""
 
     def __init__(self, workcell: Workcell, postures: list[tuple[Array, Array]]) -> None:
         ends = (workcell.task.waypoints[0].lower, workcell.task.waypoints[-1].lower)
@@ -242,8 +264,12 @@ class _Still:
             self._models = [build_robot_model(robot) for robot in workcell.robots]
 
     def exceeded(self, mass: float = 1.0, friction: float = 1.0) -> list[StaticUtilisation]:
-        """Return the exceeded limits if the payload's mass and the friction coefficients are
-        multiplied by factors."""
+        """Return the limits that are exceeded at start or goal.
+
+        Args:
+            mass: factor on the payload's mass.
+            friction: factor on both friction coefficients.
+        """
         found = []
         for where, pose in self._poses.items():
             load = still_load(self._workcell, pose, friction)
@@ -272,11 +298,12 @@ class _Still:
     def _torques(
         self, where: str, load: dict[str, Array], mass: float
     ) -> Iterator[StaticUtilisation]:
-        """Yield for each arm the use of its most loaded joint, if the arm's posture is known.
+        """Yield for each arm the torque of the joint that is nearest to its limit, if the arm's
+        posture is known.
 
         Args:
             where: end of the path, 'start' or 'goal'.
-            load: contact forces and moments of the payload at rest.
+            load: contact forces and moments of the payload at rest, from `still_load`.
             mass: factor on the payload's mass.
         """
         from symbolic.robot.arm import joint_torque
@@ -295,8 +322,11 @@ class _Still:
             yield StaticUtilisation(TORQUE, whose, where, float(torque[joint]), float(most), unit)
 
     def remedy(self, exceeded: list[StaticUtilisation]) -> str:
-        """Return a text with the mass and the friction with which the exceeded limits would be
-        kept, each with everything else unchanged."""
+        """Return a text with the largest payload mass, the least friction and the least patch
+        radius that keep the exceeded limits.
+
+        Mass and friction are alternatives, each with everything else unchanged.
+        """
         ways = []
         if any(use.quantity != PRESSURE for use in exceeded):
             ways = [way for way in (self._mass(), self._friction()) if way]
@@ -327,14 +357,27 @@ class _Still:
         return f"friction of at least {wanted}"
 
     def _bears(self, mass: float = 1.0, friction: float = 1.0) -> bool:
-        """Return True if forces and torques are within their limits with factors on mass and
-        friction."""
+        """Return True if forces and joint torques are within their limits; pressure shifts are
+        ignored.
+
+        Args:
+            mass: factor on the payload's mass.
+            friction: factor on both friction coefficients.
+        """
         return all(use.quantity == PRESSURE for use in self.exceeded(mass, friction))
 
 
 def _nearest(enough: Callable[[float], bool], here: float, far: float) -> float | None:
-    """Return the factor nearest to `here`, between `here` and `far`, for which `enough` returns
-    True; None if it returns False at `far`."""
+    """Find by bisection the factor nearest to `here`, between `here` and `far`, at which a
+    condition holds.
+
+    Args:
+        enough: function that returns True if the condition holds at a factor.
+        here, far: ends of the searched interval.
+
+    Returns:
+        The factor; None if the condition does not hold at `far`.
+    """
     if not enough(far):
         return None
     for _ in range(REMEDY_BISECTIONS):

@@ -1,9 +1,10 @@
-"""Independent calls in worker processes of this machine, through `concurrent.futures`.
+"""Parallel calls in worker processes of this machine, through `concurrent.futures`. No call depends
+on another.
 
-Functions, arguments and results can be pickled. A worker remembers by itself what it loads
-(`functools.lru_cache`). Results depend neither on who works nor on the order. A call takes seconds,
-so a call that is lost with its worker is repeated as a whole. `hybrid_opt.cluster` has the same for
-a Dask cluster.
+Functions, arguments and results have to be picklable. A worker keeps what it has loaded for later
+calls (`functools.lru_cache`). The results depend neither on the worker nor on the order of the
+calls. A call takes seconds, so a call whose worker is lost is repeated as a whole.
+`hybrid_opt.cluster` does the same on a Dask cluster.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ def ignore_result(index: int, result: object) -> None:
 
 
 class Workers(ABC):
-    """Processes that call functions in parallel; the end of a `with` block stops all work."""
+    """Processes that call functions in parallel; leaving the `with` block stops all calls."""
 
     def map(
         self,
@@ -140,7 +141,15 @@ class LocalWorkers(Workers):
     def _submit(
         self, function: Callable[[Argument], Result], arguments: Mapping[int, Argument]
     ) -> dict[Future[Result], int]:
-        """Submit calls, with which the pool starts its processes."""
+        """Submit calls to the pool of processes, which starts its processes with them.
+
+        Args:
+            function: function of one argument.
+            arguments: argument of each call by the index of the call.
+
+        Returns:
+            Index of each submitted call, by its future.
+        """
         with _interrupts_later():
             pool, before = self._started(), set(multiprocessing.active_children())
             calls = {pool.submit(call_safely, function, one): k for k, one in arguments.items()}
@@ -171,10 +180,10 @@ class LocalWorkers(Workers):
 
 
 def finished(calls: dict[Future[Result], int]) -> Iterator[tuple[int, Result]]:
-    """Yield index and result of each call in the order of completion.
+    """Yield the index and the result of each call in the order in which the calls end.
 
     Args:
-        calls: index of each submitted call.
+        calls: index of each submitted call, by its future.
     """
     for call in as_completed(calls):
         yield calls[call], call.result()
@@ -195,8 +204,9 @@ def call_safely(function: Callable[[Argument], Result], argument: Argument) -> R
 def one_thread() -> AbstractContextManager[object]:
     """Limit linear algebra to one thread within a `with` block.
 
-    Workers fill the cores, and on matrices as small as ours several threads wait for one another:
-    without it a drivable front of two attempts took 18.4 core-seconds in place of 9.3.
+    The workers already fill the cores, and on small matrices several threads would wait for one
+    another: without the limit a drivable front of two attempts took 18.4 core-seconds instead of
+    9.3.
     """
     limited: AbstractContextManager[object]
     limited = _controller(len(sys.modules)).limit(limits=1, user_api="blas")
@@ -205,8 +215,13 @@ def one_thread() -> AbstractContextManager[object]:
 
 @lru_cache(maxsize=1)
 def _controller(modules: int) -> ThreadpoolController:
-    """Return the controller of the threads of all loaded linear-algebra libraries. It is cached by
-    the number of loaded modules, because a new one takes 4 ms."""
+    """Return the controller of the threads of all loaded linear-algebra libraries.
+
+    A new controller takes 4 ms, so it is cached until further modules are loaded.
+
+    Args:
+        modules: number of loaded modules.
+    """
     return ThreadpoolController()
 
 
@@ -257,13 +272,19 @@ def _interrupts_later() -> Iterator[None]:
 
 
 def _live(lifeline: Connection) -> None:
-    """Start a thread in a new worker process that ends the process when the pool or the parent
-    process ends."""
+    """Start a thread, in a new worker process, that ends the process when the pool or the parent
+    process ends.
+
+    Args:
+        lifeline: connection whose other end closes when the pool or the parent process ends.
+    """
     Thread(target=_end_with, args=(lifeline,), daemon=True).start()
 
 
 def _end_with(lifeline: Connection) -> None:
-    """End this process, even during a call, as soon as the other end of a pipe is closed."""
+    """End this process, even during a call, as soon as the other end of the connection `lifeline`
+    is closed.
+    """
     with suppress(EOFError, OSError):
         lifeline.recv()
     os._exit(1)

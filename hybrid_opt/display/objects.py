@@ -1,7 +1,7 @@
-"""Text of objects for print; in a notebook their figures next to a picture.
+"""Display of this library's objects: text for print, and figures with a picture for a notebook.
 
-The picture of a carry shows its normal forces, that of a front its points and the search's
-candidates, that of a timing the forces of its carry.
+The picture of a carry or a timing shows the normal forces along it, that of a job the commanded
+normal forces, that of a front its points and the search's candidates.
 """
 
 from __future__ import annotations
@@ -38,12 +38,14 @@ share."""
 
 
 def text_of(shown: object) -> str:
-    """Format an object for print."""
+    """Format an object as text: a heading, then one line per figure."""
     return "\n".join([heading_of(shown), *lines(figures_of(shown))])
 
 
 def html_of(shown: object) -> str:
-    """Format an object for a notebook: its figures, or its text if it has none, and its picture."""
+    """Format an object as HTML for a notebook: a heading, its figures, and its picture; for a job
+    or a recommendation its text and its picture.
+    """
     if isinstance(shown, Job | Recommendation):
         return f"<div><pre>{html.escape(repr(shown))}</pre>{picture_of(shown)}</div>"
     heading = html.escape(heading_of(shown))
@@ -58,7 +60,7 @@ def heading_of(shown: object) -> str:
 
 @singledispatch
 def figures_of(shown: object) -> dict[str, str]:
-    """Return the figures of an object by name, with units."""
+    """Return the numbers that describe an object, formatted with their units, by name."""
     raise NotImplementedError(f"{type(shown).__name__} has no display")
 
 
@@ -115,7 +117,15 @@ def _(job: Job) -> str:
 
 
 def _forces(workcell: Workcell, time: Array, force: Array, title: str, *more: Series) -> str:
-    """Plot forces (n, 2) of both arms over times (n,) [s], with further series."""
+    """Plot the forces of both arms over time as an SVG picture.
+
+    Args:
+        workcell: the cell, for the names of the robots.
+        time: (n,) times [s].
+        force: (n, 2) force of each robot [N].
+        title: title of the force axis.
+        more: further series of the plot.
+    """
     series = [
         Series(robot.name, np.column_stack([time, force[:, i]]), ARM_COLOURS[i])
         for i, robot in enumerate(workcell.robots)
@@ -129,7 +139,7 @@ def _(found: Recommendation) -> str:
 
 
 def _torques(uses: Array) -> str:
-    """Format utilisations of torques in percent."""
+    """Format ratios of joint torques to their limits in percent, separated by commas."""
     return ", ".join(map(torque_use, uses.tolist()))
 
 
@@ -164,7 +174,7 @@ def _(front: Front) -> dict[str, str]:
 
 @picture_of.register
 def _(front: Front) -> str:
-    """Plot its points and candidates by their first two objectives."""
+    """Plot the points of a front and the search's candidates by their first two objectives."""
     if len(front) == 0 or front.objectives.shape[1] < 2:
         return ""
     series = []
@@ -184,7 +194,13 @@ def _(front: Front) -> str:
 
 
 def _nearest(cloud: Array, points: Array) -> Array:
-    """Return the candidates closest to the only point of a front, to be drawn behind it."""
+    """Return the 20 candidates closest to the only point of a front, for a plot to include; none if
+    the front has several points.
+
+    Args:
+        cloud: (n, 2) objectives of the candidates.
+        points: (k, 2) objectives of the front's points.
+    """
     if len(points) > 1 or len(cloud) == 0:
         return np.empty((0, 2))
     distance = np.abs(cloud - points[0]).max(axis=1)
@@ -198,7 +214,8 @@ def _(timing: Timing) -> str:
 
 @figures_of.register
 def _(timing: Timing) -> dict[str, str]:
-    """Format the use of each limit and its location, the most used first."""
+    """Format, for each limit, the largest ratio of value to limit and where it occurs; the largest
+    ratio first."""
     ranked = sorted(timing.use.items(), key=lambda item: -item[1].ratio)
     return {
         name: f"{100.0 * excess.ratio:5.1f} %  {_where(excess.place.robot, excess.place.joint)}"
@@ -224,7 +241,8 @@ def _(found: Sensitivities) -> str:
 
 @figures_of.register
 def _(found: Sensitivities) -> dict[str, str]:
-    """Format the effect of a usual change of each number."""
+    """Format the changes of force and duration if each number of the file changes by a usual
+    amount."""
     return {f"{row.key} = {row.value:g} {row.unit}".rstrip(): _changes(row) for row in found.rows}
 
 
@@ -269,11 +287,11 @@ MARKS = {"line": "-", "dots": "o", "cross": "+"}
 
 @dataclass(frozen=True)
 class Series:
-    """A series of points (n, 2) in a plot, drawn as a line or as marks.
+    """Points of one kind in a plot, drawn as a line or as marks.
 
     Attributes:
         label: text in the legend, '' for none.
-        points: (n, 2) coordinates.
+        points: (n, 2) coordinates in the units of the axes.
         colour: CSS colour.
         kind: 'line', 'dots' or 'cross'.
         size: width of the line or radius of the marks [pt].
@@ -287,12 +305,12 @@ class Series:
 
 
 def plot(series: list[Series], x_title: str, y_title: str, focus: Array) -> str:
-    """Draw series as an SVG picture. Points outside the axes are clipped.
+    """Draw series of points as an SVG picture. Points outside the axes are clipped.
 
     Args:
-        series: the series.
+        series: series to draw.
         x_title, y_title: titles of the axes.
-        focus: (n, 2) points that the axes have to include.
+        focus: (n, 2) points that the ranges of the axes have to include.
     """
     low, high = focus.min(axis=0), focus.max(axis=0)
     room = np.maximum(PLOT_MARGIN * (high - low), 1e-4 * np.maximum(1.0, np.abs(high)))

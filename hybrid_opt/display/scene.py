@@ -26,10 +26,13 @@ from symbolic.geometry.pairs import CellGeometry, build_geometry
 def scene_data(
     geometry: CellGeometry, carry: Carry, marked: Collection[str] = ()
 ) -> dict[str, Any]:
-    """Return the shapes of a cell, its joints along a carry, and a good viewpoint, as JSON values.
+    """Collect what `scene.js` needs to draw a cell: shapes, arms, contacts, and the region in view,
+    as JSON values.
 
     Args:
-        marked: names of bodies that are shown in red.
+        geometry: bodies of the cell.
+        carry: carry whose moving bodies are to be in view.
+        marked: names of bodies that are drawn in red.
     """
     points = motion_points(geometry, carry.pose, carry.q, moving=True)
     lower, upper = points.min(axis=0), points.max(axis=0)
@@ -64,12 +67,14 @@ lines."""
 
 
 def asset(name: str) -> str:
-    """Read the text of a script or page of this package."""
+    """Read the text of a script or page in the folder of `hybrid_opt.display`."""
     return (files("hybrid_opt.display") / name).read_text("utf-8")
 
 
 def embedded_json(document: Any) -> str:
-    """Write JSON for a script element. No text in the JSON can end the element or open another."""
+    """Convert JSON values to text that can stand in an HTML script element: no text in it can end
+    the element or open another.
+    """
     text = json.dumps(document, allow_nan=False, separators=(",", ":"))
     for letter in "<>&\u2028\u2029":
         text = text.replace(letter, f"\\u{ord(letter):04x}")
@@ -77,7 +82,12 @@ def embedded_json(document: Any) -> str:
 
 
 def packed(values: NDArray[Any], kind: type[np.generic]) -> str:
-    """Encode numbers as little-endian bytes in base64."""
+    """Encode an array as base64 text of little-endian bytes.
+
+    Args:
+        values: the array.
+        kind: NumPy type in which the numbers are encoded.
+    """
     return base64.b64encode(
         np.ascontiguousarray(values, dtype=np.dtype(kind).newbyteorder("<")).tobytes()
     ).decode("ascii")
@@ -101,12 +111,12 @@ MAX_SAMPLES = 200
 
 @dataclass(frozen=True)
 class Look:
-    """The first view of a carry.
+    """First view of a carry when its page opens.
 
     Attributes:
-        sample: index of the sample.
+        sample: index of the sample of the carry that is shown.
         text: caption of the view.
-        bodies: names of the bodies that are shown in red.
+        bodies: names of the bodies that are drawn in red.
     """
 
     sample: int

@@ -1,7 +1,7 @@
 """The bodies of a cell as triangle meshes, and their poses along a carry.
 
-Meshes of simple shapes are made here. trimesh, which reads mesh files, takes longer to start than
-drawing a picture.
+Meshes of simple shapes are computed here, because the library trimesh, which reads mesh files,
+takes longer to load than a picture to draw.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ GROUND_SIZE = 2.5
 
 @dataclass(frozen=True)
 class Solid:
-    """A body as triangles in the frame to which it is fixed.
+    """A collision body as a triangle mesh.
 
     Attributes:
         name, group: name and group of the collision body.
-        frame: frame to which the body is fixed.
-        vertices: (n, 3) [m].
-        faces: (m, 3) indices of vertices, with outward normals.
-        is_ground: whether the body is a large fixed plate.
+        frame: frame to which the body is fixed, and in which its vertices are given.
+        vertices: (n, 3) vertices [m].
+        faces: (m, 3) indices of the three vertices of each triangle, with outward normals.
+        is_ground: True if the body is a large plate fixed in the world.
     """
 
     name: str
@@ -50,7 +50,7 @@ class Solid:
 
 
 def cell_solids(geometry: CellGeometry) -> tuple[Solid, ...]:
-    """Convert every collision body of a cell to triangles."""
+    """Convert every collision body of a cell to a triangle mesh."""
     return tuple(_triangles(CacheKey(body, known=body.content)) for body in geometry.bodies)
 
 
@@ -74,7 +74,12 @@ def _triangles(seen: CacheKey) -> Solid:
 
 
 def _mesh(shape: ConvexShape) -> tuple[Array, NDArray[np.int64]]:
-    """Compute vertices (n, 3) in the frame of the shape, and faces (m, 3) with outward normals."""
+    """Compute the triangle mesh of a convex shape.
+
+    Returns:
+        Vertices (n, 3) in the frame of the shape [m], and faces (m, 3) as vertex indices, with
+            outward normals.
+    """
     match shape:
         case Box():
             return box_corners(shape.size), _BOX_FACES
@@ -104,8 +109,15 @@ _BOX_FACES = np.array(
 
 
 def _revolved(across: Array, along: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Compute the mesh of a curve rotated about z. The curve is given by distances (n,) from z and
-    positions (n,) along z [m], from its lower to its upper end, both on the axis."""
+    """Compute the triangle mesh of a curve rotated about z.
+
+    Args:
+        across: (n,) distances of the curve's points from the z axis [m]; zero at both ends.
+        along: (n,) positions of the points along z [m], from the lower to the upper end.
+
+    Returns:
+        Vertices (k, 3) [m], and faces (m, 3) as vertex indices, with outward normals.
+    """
     rings, angles = len(across) - 2, np.linspace(0.0, 2.0 * np.pi, SECTIONS + 1)[:-1]
     circle = np.column_stack([np.cos(angles), np.sin(angles), np.ones(SECTIONS)])
     scales = np.column_stack([across, across, along])[1:-1]
@@ -124,8 +136,15 @@ def _revolved(across: Array, along: Array) -> tuple[Array, NDArray[np.int64]]:
 
 
 def joint_placements(arm: ArmGeometry, q: Array) -> Array:
-    """Compute the joint frames (n, n_joints, 4, 4) of an arm in the world at joint positions q (n,
-    n_joints)."""
+    """Compute the poses of an arm's joint frames in the world.
+
+    Args:
+        arm: geometry of the arm.
+        q: (n, n_joints) joint positions [rad or m].
+
+    Returns:
+        Transforms (n, n_joints, 4, 4) from each joint frame to the world frame.
+    """
     placed = np.empty((*q.shape, 4, 4))
     T = np.broadcast_to(arm.T_world_root, (len(q), 4, 4))
     for j in range(q.shape[1]):
@@ -141,12 +160,15 @@ def joint_placements(arm: ArmGeometry, q: Array) -> Array:
 
 
 def frame_placements(geometry: CellGeometry, pose: Array, q: Array) -> dict[Frame, Array]:
-    """Compute the pose (n, 4, 4) of every frame in the world at n samples.
+    """Compute the poses of the world, the box and all links of both arms in the world at n samples.
 
     Args:
         geometry: bodies of the cell.
         pose: (n, 6) box poses [m, rad].
-        q: (n, all joints) joint positions [rad].
+        q: (n, all joints) joint positions of both arms side by side [rad].
+
+    Returns:
+        Transforms (n, 4, 4) to the world frame, by frame.
     """
     placed = {
         Frame("world"): np.broadcast_to(np.eye(4), (len(pose), 4, 4)),
@@ -164,14 +186,16 @@ def frame_placements(geometry: CellGeometry, pose: Array, q: Array) -> dict[Fram
 def extent_points(
     geometry: CellGeometry, solids: tuple[Solid, ...], pose: Array, q: Array
 ) -> Array:
-    """Compute the corners (k, 3) [m] of the bounding boxes of all solids at n samples, without the
-    ground. A picture that shows these points shows the whole scene.
+    """Compute the corners (k, 3) of the bounding boxes of solids at n samples, world frame [m].
+    Ground plates are left out.
+
+    A picture that shows these points shows the whole scene.
 
     Args:
         geometry: bodies of the cell.
         solids: the solids.
         pose: (n, 6) box poses [m, rad].
-        q: (n, all joints) joint positions [rad].
+        q: (n, all joints) joint positions of both arms side by side [rad].
     """
     placed = frame_placements(geometry, pose, q)
     points = []
@@ -191,13 +215,13 @@ _VIEWED = 12
 
 
 def motion_points(geometry: CellGeometry, pose: Array, q: Array, moving: bool = False) -> Array:
-    """Return points (k, 3) [m] that a picture of a whole motion has to show.
+    """Compute points (k, 3) that a picture of a whole motion has to show, world frame [m].
 
     Args:
         geometry: bodies of the cell.
         pose: (n, 6) box poses [m, rad].
-        q: (n, all joints) joint positions [rad].
-        moving: True if only arms and payload count.
+        q: (n, all joints) joint positions of both arms side by side [rad].
+        moving: True to consider arms and payload only, False for all bodies but the ground.
     """
     every = slice(None, None, max(1, len(pose) // _VIEWED))
     solids = cell_solids(geometry)

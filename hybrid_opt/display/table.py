@@ -22,7 +22,9 @@ TERMINAL_WIDTH = 100
 
 
 def number(value: float | None, digits: int = 2, scale: float = 1.0) -> str:
-    """Format a figure times `scale` with so many digits; `NOTHING` for None."""
+    """Format a number multiplied by `scale` with a fixed number of decimals; `NOTHING` if it is
+    None or not finite.
+    """
     if value is None or not math.isfinite(value):
         return NOTHING
     return f"{value * scale:z.{digits}f}"
@@ -33,8 +35,10 @@ UNPUBLISHED = "unknown"
 
 
 def torque_use(use: float | None) -> str:
-    """Format a utilisation of joint torques in percent; `UNPUBLISHED` for zero, the utilisation of
-    unknown limits."""
+    """Format a ratio of joint torque to torque limit in percent.
+
+    A ratio of zero means that the robot's limits are unknown, and gives `UNPUBLISHED`.
+    """
     return UNPUBLISHED if use == 0.0 else number(use, 1, 100.0)
 
 
@@ -45,11 +49,12 @@ def counted(count: int, noun: str) -> str:
 
 @dataclass(frozen=True)
 class Quantity:
-    """Number format of a quantity in tables, figures and pages.
+    """Name, unit and number format of a quantity in tables, figures and pages.
 
     Attributes:
-        name, unit: name and unit of its column; '' for the unit of a pure number.
-        digits: number of digits after the decimal point.
+        name: name of the quantity.
+        unit: unit in which it is printed, '' for a pure number.
+        digits: number of decimals.
         scale: factor from the value in SI units to the printed value.
     """
 
@@ -59,20 +64,24 @@ class Quantity:
     scale: float = 1.0
 
     def heading(self, whose: str = "") -> str:
-        """Format the heading of a column: the name, the owner `whose`, and the unit."""
+        """Format the heading of a column: name, owner of the quantity (`whose`, such as a robot),
+        and unit.
+        """
         named = f"{self.name}, {whose}" if whose else self.name
         return f"{named} [{self.unit}]" if self.unit else named
 
     def __call__(self, value: float | None) -> str:
-        """Format a value."""
+        """Format a value in SI units as a printed number without its unit."""
         return number(value, self.digits, self.scale)
 
     def mean(self, mean: float | None, std: float | None) -> str:
-        """Format mean and standard deviation."""
+        """Format a mean and a standard deviation in SI units as 'mean ± deviation'."""
         return f"{self(mean)} ± {self(std)}"
 
     def spread(self, middle: float, low: float, high: float) -> str:
-        """Format a middle value with the range around it; the value alone if the range is empty."""
+        """Format a middle value and its range as 'middle [low, high]'; without the range if low
+        equals high.
+        """
         if low == high or not math.isfinite(middle):
             return self(middle)
         return f"{self(middle)} [{self(low)}, {self(high)}]"
@@ -80,12 +89,13 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Table:
-    """A table of texts.
+    """Table whose cells are texts.
 
     Attributes:
-        name: name of the table's files, without suffix.
+        name: name of the files to which the table is written, without suffix.
         title: title above the table.
-        header, rows: cells. The first column names the row.
+        header: heading of each column.
+        rows: cells of each row; the first cell names the row.
         note: note below the table.
     """
 
@@ -97,30 +107,31 @@ class Table:
 
     @property
     def words(self) -> tuple[bool, ...]:
-        """For each column True if it contains words, which are flush left. Columns of figures are
-        flush right."""
+        """For each column, True if it contains words and is flush left, False if it contains
+        numbers and is flush right.
+        """
         columns = zip(*self.rows, strict=True) if self.rows else [()] * len(self.header)
         return tuple(k == 0 or not any(map(_is_figure, column)) for k, column in enumerate(columns))
 
     def text(self) -> str:
-        """Format for a terminal."""
+        """Format the table as text for a terminal."""
         left = [k for k, word in enumerate(self.words) if word]
         parts = [self.title, text_table([self.header, *self.rows], left)]
         return "\n".join(parts + ([textwrap.fill(self.note, TERMINAL_WIDTH)] if self.note else []))
 
     def csv(self) -> str:
-        """Format as comma-separated values, without title and note."""
+        """Format the table as comma-separated values, without title and note."""
         return csv_text(self.header, self.rows)
 
     def markdown(self) -> str:
-        """Format as a Markdown table with title and note."""
+        """Format the table in Markdown, with title and note."""
         rule = tuple("---" if word else "---:" for word in self.words)
         lines = [self.header, rule, *self.rows]
         body = "\n".join("| " + " | ".join(map(_markdown, row)) + " |" for row in lines)
         return f"**{_markdown(self.title)}**\n\n{body}\n\n{_markdown(self.note)}\n"
 
     def latex(self) -> str:
-        """Format as a LaTeX table with booktabs rules."""
+        """Format the table in LaTeX with booktabs rules."""
         columns = "".join("l" if word else "r" for word in self.words)
         head, *rows = (" & ".join(map(_latex, row)) + r" \\" for row in (self.header, *self.rows))
         lines = [
@@ -140,7 +151,7 @@ class Table:
         return "\n".join(lines)
 
     def html(self) -> str:
-        """Format as an HTML table; every text is escaped."""
+        """Format the table in HTML; every text is escaped."""
         head, *body = (
             "".join(map(_html_cell, [kind] * len(row), row, self.words))
             for kind, row in (("th", self.header), *(("td", row) for row in self.rows))
@@ -153,10 +164,11 @@ class Table:
 
 
 def text_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> str:
-    """Format rows in columns, with a line below the first row, the head.
+    """Format rows of cells as text in aligned columns, with a rule below the first row, the
+    heading.
 
     Args:
-        rows: rows of cells, all of equal length.
+        rows: rows of cells, all of equal length, the heading first.
         left: indices of columns that are flush left; the others are flush right.
     """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -171,13 +183,13 @@ def text_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> s
 
 
 def lines(figures: Mapping[str, str]) -> list[str]:
-    """Format one line per figure, with aligned values."""
+    """Format named texts as one line each, 'name  text', with the texts aligned."""
     width = max((len(name) for name in figures), default=0)
     return [f"  {name:<{width}}  {value}" for name, value in figures.items()]
 
 
 def figures_html(figures: Mapping[str, str]) -> str:
-    """Format figures as an HTML table of two columns."""
+    """Format named texts as an HTML table of two columns, name and text."""
     rows = "".join(
         f'<tr><th style="text-align:left">{html.escape(name)}</th>'
         f'<td style="text-align:left">{html.escape(value)}</td></tr>'
@@ -187,7 +199,7 @@ def figures_html(figures: Mapping[str, str]) -> str:
 
 
 def _is_figure(cell: str) -> bool:
-    """Return True if a cell is a figure, possibly with a unit or a spread."""
+    """Return True if a cell is short and begins with a number; a unit or a range may follow."""
     return len(cell) <= LONGEST_CELL and re.match(r"[-+\N{MINUS SIGN}]?\.?\d", cell) is not None
 
 
