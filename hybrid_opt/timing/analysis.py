@@ -76,7 +76,12 @@ class ForceCurve:
 
 
 def check_search_timing(model: TimingModel, x: Array) -> Timing:
-    """Check the timing under which the search evaluated x against every limit of the workcell.
+    """Check the timing under which the search evaluated a decision vector against all limits of the
+    workcell.
+
+    Args:
+        model: timing model of the workcell.
+        x: (n_var,) decision vector.
 
     Returns:
         Timing with the utilisation of every limit. Its status is `OK`; `EXCEEDED` if a limit is
@@ -101,8 +106,11 @@ def check_search_timing(model: TimingModel, x: Array) -> Timing:
 
 
 def _jump(model: TimingModel, carry: Carry) -> Place | None:
-    """Return the joint that moves fastest, relative to its speed limit, at the start or end of the
-    carry; None if all joints are at rest there."""
+    """Return the place of a jump of the joint speeds at the start or end of a carry.
+
+    The place names the joint that is fastest there, relative to its speed limit. None if all joints
+    start and end at rest.
+    """
     limit = model.workcell.stack_joint_limits("velocity_max")
     ends = np.abs(carry.stack_arms("q_rate")[[0, -1]]) / limit
     if float(ends.max()) < REST_SPEED:
@@ -115,10 +123,14 @@ def _jump(model: TimingModel, carry: Carry) -> Place | None:
 
 
 def drivable_timing(model: TimingModel, x: Array) -> Timing:
-    """Time a drivable carry x (n_var,) within its own force limit.
+    """Compute the fastest timing of a drivable carry within its own force limit.
 
     The search's timing is kept if it satisfies the limits between its grid points too. Otherwise
     the path is timed again by `time_path`.
+
+    Args:
+        model: timing model of the workcell.
+        x: (n_var,) decision vector.
 
     Raises:
         SettingsError: x does not fit the workcell.
@@ -137,19 +149,26 @@ def drivable_timing(model: TimingModel, x: Array) -> Timing:
 
 def closest_to_reference_timing(model: TimingModel, x: Array) -> Timing:
     """Compute the fastest timing from rest to rest that never exceeds the task's reference speeds.
-    The box moves at a reference speed wherever the other limits allow it."""
+
+    The box moves at a reference speed wherever the other limits allow this.
+
+    Args:
+        model: timing model of the workcell.
+        x: (n_var,) decision vector.
+    """
     return time_path(model, x, TimingLimits(reference_speed=True))
 
 
 def duration_against_force_limit(
     model: TimingModel, x: Array, points: int = 12, on_timing: Callable[[], None] = lambda: None
 ) -> ForceCurve:
-    """Compute the fastest timing under each of several limits on the normal forces.
+    """Compute the fastest timing of one path under each of several limits on the normal forces.
 
-    The limits lie between the force at rest and the largest force of the unlimited timing. Their
-    excess over the force at rest is spaced evenly in its logarithm.
+    The limits lie between the force at rest and the largest force of the timing without force
+    limit. Their excess over the force at rest grows geometrically.
 
     Args:
+        model: timing model of the workcell.
         x: (n_var,) decision vector.
         points: number of force limits.
         on_timing: called after every timing.
@@ -284,17 +303,22 @@ class StoredTiming:
     """One stored `Timing`. The fields after `use` describe its carry and are None if there is no
     carry.
 
+    Pairs have one value per robot.
+
     Attributes:
         status, reason, iterations, slowed, seconds: the fields of `Timing` of these names.
         duration: [s], NaN if there is no timing.
-        use: largest value over its limit, by name of the limit.
+        use: largest utilisation and its place, by name of the limit.
         objectives: (2,) largest normal forces over the reference forces.
         payload_limit: largest payload mass [kg] at the same timing.
-        peak_normal_force, peak_resultant_force: (2,) [N].
+        peak_normal_force, peak_resultant_force: (2,) largest normal and largest total contact force
+            [N].
         least_friction_margin: (2,) least unused share of the friction.
-        peak_pressure_shift: (2,) [m].
-        peak_point_moment_residual, peak_moment_residual: [N m].
-        joint_use: (n joints,) largest utilisation of each joint by limit, both arms in order.
+        peak_pressure_shift: (2,) largest shift of the centre of pressure [m].
+        peak_point_moment_residual, peak_moment_residual: largest moment [N m] that the contact
+            forces leave unbalanced if they act at the nominal contact points, and at the shifted
+            centres of pressure.
+        joint_use: (all joints,) largest utilisation of each joint, by name of the limit.
     """
 
     status: TimingStatus
@@ -323,7 +347,7 @@ class StoredJerk:
         status: outcome of the timing.
         duration: [s], NaN if there is no timing.
         without: duration of the fastest timing without jerk limits [s], NaN if there is none.
-        joint_use, payload_use: largest joint jerk and payload jerk over their limits.
+        joint_use, payload_use: largest joint jerk and largest payload jerk, each over its limit.
     """
 
     status: TimingStatus

@@ -85,8 +85,11 @@ class ForwardBackwardPasses:
         self._has_scalar_squeeze = command_model(self.workcell).has_scalar_squeeze
 
     def supports(self, limits: TimingLimits) -> bool:
-        """Return True if the passes can impose these limits. Robust forces need a contact model
-        with a scalar squeeze."""
+        """Return True if the passes can impose these limits.
+
+        They cannot impose robust force limits of a contact model without a scalar squeeze
+        (`ContactModel.has_scalar_squeeze`).
+        """
         return self._has_scalar_squeeze or not limits.robust
 
     def time(
@@ -95,11 +98,12 @@ class ForwardBackwardPasses:
         """Compute the fastest timing of each of n paths.
 
         Args:
-            paths: coefficients by name: limits (n, 2 intervals + 1, columns of
-                `symbolic.limits.limit_layout`); for robust limits also pose, pose_first and
-                pose_second (n, 2 intervals + 1, 6 or more).
-            limits: limits of all paths, which the passes support.
-            force: (n,) force limit of each path in place of that of `limits` [N].
+            paths: arrays by name. `limits` (n, 2 intervals + 1, columns of
+                `symbolic.limits.limit_layout`) are the coefficients of the limits at both ends and
+                in the middle of every interval. Robust limits also need `pose`, `pose_first` and
+                `pose_second` (n, 2 intervals + 1, 6 or more) there.
+            limits: limits of all paths, for which `supports` returns True.
+            force: (n,) force limit of each path [N]; None for that of `limits`.
         """
         most = np.inf if limits.force is None else limits.force
         options = np.empty((len(paths["limits"]), 4))
@@ -174,7 +178,7 @@ class RobustCuttingPlanes:
         Args:
             passes: `forward_backward_passes` with `CUTS_PER_SAMPLE`.
             forces: robust forces of the workcell's paths.
-            paths: coefficients and poses as `ForwardBackwardPasses.time` takes them.
+            paths: arrays by name, as for `ForwardBackwardPasses.time`.
             options: (n, 4) options of the passes; the first column holds finite force limits [N].
         """
         n, samples = paths["pose"].shape[:2]
@@ -195,8 +199,12 @@ class RobustCuttingPlanes:
     def time(self, threads: int) -> tuple[dict[str, Array], list[AtRest | None]]:
         """Time all paths.
 
+        Args:
+            threads: number of threads that share the paths.
+
         Returns:
-            Outputs of the passes by name, and for each path its excess at rest, else None.
+            Outputs of the passes by name; and for each path its largest robust forces at rest and
+            their sample if these exceed the force limit, else None.
         """
         still = self._at_rest()
         out = self._passes.batch(self._rows, self._options, self._cuts, threads=threads)
@@ -212,8 +220,14 @@ class RobustCuttingPlanes:
         return out, still
 
     def _at_rest(self) -> list[AtRest | None]:
-        """Find paths whose robust force limit fails at rest, and add the cutting plane at u' = 0 to
-        the others."""
+        """Find the paths whose robust forces at rest exceed the force limit.
+
+        The other paths get the tangents of robust forces at u' = 0 as supporting lines.
+
+        Returns:
+            For each path its largest robust forces at rest and their sample if these exceed the
+            limit, else None.
+        """
         n, samples = self._count.shape
         found: list[AtRest | None] = [None] * n
         path, sample = np.divmod(np.arange(n * samples), samples)
@@ -230,11 +244,11 @@ class RobustCuttingPlanes:
         return found
 
     def _cut(self, chosen: NDArray[np.intp], squared: Array) -> NDArray[np.bool_]:
-        """Add tangents where the timings of the chosen paths come near their force limits.
+        """Add supporting lines where timings exceed the robust force limits of their paths.
 
         Args:
             chosen: (m,) indices of paths.
-            squared: (m, intervals + 1) squared path speeds of their timings.
+            squared: (m, intervals + 1) squared path speeds of their timings [1/s^2].
 
         Returns:
             (m,) True for paths whose robust forces exceed their limit.
@@ -271,12 +285,14 @@ class RobustCuttingPlanes:
         force: Array,
         slope: Array,
     ) -> None:
-        """Add the tangent of the larger of two forces at points z (m, 2) = (u'', u'^2).
+        """Add a supporting line at each of m points: the tangent of the larger force of both
+        robots.
 
         Args:
-            place: path and sample of each point, (m,) each.
-            force: (m, 2) [N].
-            slope: (m, 2, 2) by (u'', u'^2).
+            place: index of the path and of the sample of each point, (m,) each.
+            z: (m, 2) values of (u'', u'^2) at the points [1/s^2].
+            force: (m, 2) robust forces [N].
+            slope: (m, 2, 2) derivatives of the forces by (u'', u'^2).
         """
         larger, every = force.argmax(axis=1), np.arange(len(force))
         limit = self._limit[place[0]]
@@ -308,22 +324,25 @@ PASS_STATUSES = (
 def forward_backward_passes(
     compiled: CompiledCell, intervals: int, cuts: int = 0
 ) -> NumericFunction:
-    """Load or build the timing of one path from its limits by a backward and a forward pass.
+    """Load or build the compiled function that times one path by a backward and a forward pass.
 
-    Inputs: samples (2 intervals + 1, `symbolic.limits.limit_layout`) at both ends and the middle of
-    every interval; options (4,): largest normal force [N], infinite for none, then 0 or 1 each for
-    limits on torques, pressure shifts and the reference speeds; with cuts, cuts (2 intervals + 1,
-    cuts, 3): at every sample lines alpha u'' + beta u'^2 <= bound with positive bounds, infinite
+    Inputs of this function: `samples` (2 intervals + 1, columns of `symbolic.limits.limit_layout`),
+    the coefficients of the limits at both ends and in the middle of every interval; `options` (4,),
+    the largest normal force [N], infinite for none, then 0 or 1 each for limits on torques,
+    pressure shifts and the reference speeds; with supporting lines also `cuts` (2 intervals + 1,
+    cuts, 3), at every sample lines alpha u'' + beta u'^2 <= bound with positive bounds, infinite
     after the last line.
 
-    Outputs: status, an index into `PASS_STATUSES`; interval of a failure; duration [s], infinite if
-    there is no timing; peak (2,) normal forces [N]; use (len(LIMIT_NAMES), 3): largest share of
-    each limit, with the path parameter and the joint or contact there; squared (intervals + 1,):
-    u'^2 at the grid points; sweeps: iterations of both passes; slowed: factor on the speed. If
-    there is no timing, peak and use describe rest.
+    Outputs: `status`, an index into `PASS_STATUSES`; `interval` of a failure; `duration` [s],
+    infinite if there is no timing; `peak` (2,), largest normal forces [N]; `use` (len(LIMIT_NAMES),
+    3), largest share of each limit, with the path parameter and the joint or contact there;
+    `squared` (intervals + 1,), u'^2 at the grid points [1/s^2]; `sweeps`, iterations of both
+    passes; `slowed`, factor on the speed. If there is no timing, peak and use describe rest.
 
     Args:
+        compiled: the workcell with its compiled functions.
         intervals: number of intervals of constant path acceleration.
+        cuts: number of supporting lines per sample.
     """
     details = (str(intervals), str(cuts), source_digest(__name__, "symbolic.limits"), _passes_c())
     key = compiled.key("path timing", *details, bodies=False)
@@ -442,13 +461,17 @@ def failed_timing(status: TimingStatus, place: Place, intervals: int) -> PathTim
 def path_failure(
     workcell: Workcell, pose: Array, lost: Array, limit_margin: Array, manipulability: Array
 ) -> tuple[TimingStatus, Place, str] | None:
-    """Return status, place and reason of the error of a path on which nothing moves or an arm
-    fails, else None.
+    """Find the error of a path on which nothing moves or an arm fails.
 
     Args:
-        pose: (n, 6) box poses at uniform samples.
-        lost, limit_margin, manipulability: (n, 2) outputs of `symbolic.robot.arm.TRACK_OUTPUTS` of
-            these names, by sample and arm.
+        workcell: the workcell.
+        pose: (n, 6) box poses at uniform samples of the path parameter.
+        lost: (n, 2) by sample and arm, 0 while the arm has reached all samples up to here, else 1.
+        limit_margin: (n, 2) least distance of a joint to its limits [rad], negative beyond them.
+        manipulability: (n, 2) absolute determinant of the Jacobian [m^3].
+
+    Returns:
+        Status, place and reason of the error; None without an error.
     """
     if float(np.abs(pose - pose[0]).max()) < LEAST_MOTION:
         reason = "all poses of the path are the same: there is nothing to time"

@@ -90,15 +90,15 @@ class PathTimer:
         self._model = None if has_all else TimingModel(compiled, intervals)
 
     def path_limits(self, x: Array) -> dict[str, Array]:
-        """Compute the geometry of paths and the coefficients of their limits, at both ends and in
-        the middle of every interval.
+        """Compute the geometry of n paths and the coefficients of their limits.
 
         Args:
-            x: (n, n_var) free waypoints of n paths.
+            x: (n, n_path) free waypoints.
 
         Returns:
             Outputs of `symbolic.limit_coefficients.path_function` by name, and `limits` (n, 2
-            intervals + 1, columns of `symbolic.limits.limit_layout`).
+            intervals + 1, columns of `symbolic.limits.limit_layout`), at both ends and in the
+            middle of every interval.
         """
         # One path is not worth a second thread.
         threads = self._threads if len(x) > 1 else 1
@@ -112,7 +112,7 @@ class PathTimer:
         """Compute the fastest timing from rest to rest of one path.
 
         Args:
-            x: (n_var,) free waypoints.
+            x: (n_path,) free waypoints.
             limits: limits in addition to the workcell's.
 
         Raises:
@@ -122,8 +122,9 @@ class PathTimer:
         return timing
 
     def path_errors(self, paths: dict[str, Array]) -> list[PathTiming | None]:
-        """Return for each path the error that excludes any timing: no motion, an arm that loses the
-        path, joint limits, or manipulability; else None.
+        """Return for each path the error that excludes any timing, else None.
+
+        Errors are: no motion, an arm that loses the path, joint limits, and manipulability.
 
         Args:
             paths: result of `path_limits`.
@@ -147,13 +148,14 @@ class PathTimer:
         paths: dict[str, Array] | None = None,
         path_errors: Sequence[PathTiming | None] | None = None,
     ) -> list[PathTiming]:
-        """Compute the fastest timing of each of n paths.
+        """Compute the fastest timing from rest to rest of each of n paths.
 
         Args:
-            x: (n, n_var) free waypoints.
+            x: (n, n_path) free waypoints.
             limits: limits of all paths, in addition to the workcell's.
-            force: (n,) force limit of each path in place of that of `limits` [N].
-            paths, path_errors: results of `path_limits` and `path_errors`; computed if None.
+            force: (n,) force limit of each path [N]; None for that of `limits`.
+            paths: result of `path_limits`; computed if None.
+            path_errors: result of `path_errors`; computed if None.
 
         Raises:
             SettingsError: x has the wrong shape or is not finite, or a force limit is not positive.
@@ -219,10 +221,10 @@ class TimedCandidate:
     """A candidate with its fastest timing.
 
     Attributes:
-        timing: the timing, or its error.
+        timing: the timing, or the error of the path.
         duration: [s], infinite without a timing that respects every limit.
-        squared: (intervals + 1,) u'^2 at the grid points.
-        joints: of both arms at the grid points (intervals + 1, n) [rad].
+        squared: (intervals + 1,) squared path speed u'^2 at the grid points [1/s^2].
+        joints: (intervals + 1, n) joint positions of each arm at the grid points [rad].
     """
 
     timing: PathTiming
@@ -245,7 +247,7 @@ class CandidateDriver:
         Args:
             timer: computes the timings.
             threads: number of threads that share a batch of candidates.
-            robust: whether force limits apply to robust forces.
+            robust: whether force limits apply to every case of the workcell's uncertainty.
         """
         self._task = timer.workcell.task
         self._threads = threads
@@ -263,23 +265,26 @@ class CandidateDriver:
         return self.timer.time_all(paths, self._limits, np.maximum(force, LEAST_FORCE_LIMIT))
 
     def durations(self, paths: Array, force: float) -> Array:
-        """Compute durations (n,) [s] of paths (n, n_path) within a force limit [N], infinite
-        without a timing."""
+        """Compute the durations (n,) [s] of paths (n, n_path) within one force limit [N].
+
+        A path without a timing has an infinite duration.
+        """
         found = self.time_paths(paths, np.full(len(paths), force))
         return np.array([t.duration if t.status is TimingStatus.OK else np.inf for t in found])
 
     def outputs(self, candidate: NumericFunction, x: Array) -> dict[str, Array]:
-        """Compute every per-sample output of n candidates under their timings.
+        """Compute the outputs of n candidates under their fastest timings.
 
         Args:
             candidate: compiled `symbolic.functions.candidate_function`.
             x: (n, n_var) decision vectors. A path without a timing stands still for one second.
 
         Returns:
-            Outputs of `candidate` by name; peak_force (n, 2), the largest normal forces [N];
-            drive_violation (n, len(DRIVE_CONSTRAINTS)); drive_position (n,), the path parameter of
-            a violation, NaN if there is none. With robust limits also robust_force (n, 2), the
-            largest normal forces over all cases of the workcell's uncertainty [N].
+            Outputs of `candidate` by name, and `peak_force` (n, 2), the largest normal forces [N];
+            `drive_violation` (n, len(DRIVE_CONSTRAINTS)), positive where there is no timing;
+            `drive_position` (n,), the path parameter of a violation, NaN if there is none. With
+            robust limits also `robust_force` (n, 2), the largest normal forces over all cases of
+            the workcell's uncertainty [N].
         """
         if len(x) == 1:
             timings = [self.time_candidate(x[0]).timing]
@@ -316,8 +321,10 @@ class CandidateDriver:
         return outputs | {"drive_violation": violation, "drive_position": position}
 
     def time_candidate(self, x: Array) -> TimedCandidate:
-        """Compute the timing of one decision vector (n_var,). The last result is cached, because a
-        polish asks for it several times in a row."""
+        """Compute the fastest timing of a decision vector x (n_var,) within its own force limit.
+
+        The last result is cached, because a polish asks for it several times in a row.
+        """
         key = x.tobytes()
         if self._last is None or self._last[0] != key:
             path, force = x[None, : self._task.n_path], np.maximum(x[-1:], LEAST_FORCE_LIMIT)
@@ -331,8 +338,12 @@ class CandidateDriver:
 
 
 def _speed_profile_at(timing: PathTiming, u: Array) -> tuple[Array, Array, Array]:
-    """Return time, u' and u'' at path parameters u (n,), each (n,). At a grid point u'' belongs to
-    the interval that begins there."""
+    """Compute time [s], path speed u' [1/s] and path acceleration u'' [1/s^2] at path parameters u
+    (n,), each (n,).
+
+    At a grid point u'' belongs to the interval that begins there. A path without a timing is at
+    rest.
+    """
     if not np.isfinite(timing.duration):
         return u, np.zeros_like(u), np.zeros_like(u)
     squared = timing.grid_speed**2
@@ -350,8 +361,11 @@ def _speed_profile_at(timing: PathTiming, u: Array) -> tuple[Array, Array, Array
 
 
 def search_timing(model: TimingModel, x: Array) -> PathTiming:
-    """Compute the timing that a search gives a drivable carry x (n_var,) within its own force
-    limit.
+    """Compute the timing that a search gives a drivable carry within its own force limit.
+
+    Args:
+        model: timing model of the workcell.
+        x: (n_var,) decision vector.
 
     Raises:
         SettingsError: x does not fit the workcell.
@@ -360,7 +374,11 @@ def search_timing(model: TimingModel, x: Array) -> PathTiming:
 
 
 def search_carry(model: TimingModel, x: Array) -> Carry:
-    """Compute the carry of x (n_var,) under the task's own time law.
+    """Compute the carry that a search evaluates, under the task's own time law.
+
+    Args:
+        model: timing model of the workcell.
+        x: (n_var,) decision vector.
 
     Raises:
         SettingsError: x does not fit the workcell.

@@ -125,7 +125,12 @@ class JerkLimits:
 
 @dataclass(frozen=True)
 class Utilisation:
-    """Largest ratio of a quantity to its limit, and the place where it occurs."""
+    """The largest value of a quantity over its limit along a carry.
+
+    Attributes:
+        ratio: the largest value over the limit; above 1 the limit is exceeded.
+        place: the limit, and the place where the ratio is largest.
+    """
 
     ratio: Figure
     place: Place

@@ -48,9 +48,9 @@ class PayloadSensitivity:
 
     Attributes:
         mass: the workcell's payload mass [kg].
-        resultant: (2,) largest |f_i| of each robot at that mass [N].
-        mass_by_resultant: (2,) payload mass at which |f_i| of each robot reaches its reference
-            force [kg], as the paper defines it.
+        resultant: (2,) largest total contact force of each robot at this mass [N].
+        mass_by_resultant: (2,) payload mass [kg] at which each robot's total contact force reaches
+            its reference force, as the paper defines it.
     """
 
     mass: float
@@ -59,12 +59,13 @@ class PayloadSensitivity:
 
     @property
     def payload_limit(self) -> float:
-        """Return the smallest payload mass [kg] at which |f_i| of a robot reaches its reference
-        force."""
+        """The smallest payload mass [kg] at which the total contact force of a robot reaches its
+        reference force."""
         return float(self.mass_by_resultant.min())
 
     def force_at(self, masses: Array) -> Array:
-        """Return the largest |f_i| (n, 2) [N] of both robots at payload masses (n,) [kg]."""
+        """Return the largest total contact forces (n, 2) [N] of both robots at payload masses (n,)
+        [kg]."""
         forces: Array = np.asarray(masses)[:, None] / self.mass * self.resultant
         return forces
 
@@ -74,11 +75,13 @@ class Margin:
     """Largest error of one assumption that a carry tolerates.
 
     Attributes:
-        quantity: name of the assumption.
-        unit: unit of the values, '' for a pure number.
-        nominal: value in the workcell.
-        limit: last value at which no limit is exceeded, to 1e-7 of the scanned range.
-        fails: name of the limit exceeded beyond it, '' if none is exceeded in the scanned range.
+        quantity: name of the assumed quantity, such as a friction coefficient.
+        unit: unit of `nominal` and `limit`, '' for a pure number.
+        nominal: value of the quantity in the workcell.
+        limit: last value of the quantity at which no limit is exceeded, to 1e-7 of the scanned
+            range.
+        fails: name of the limit that is exceeded beyond it, '' if none is exceeded in the scanned
+            range.
     """
 
     quantity: str
@@ -89,7 +92,7 @@ class Margin:
 
 
 def payload_sensitivity(carry: Carry) -> PayloadSensitivity:
-    """Return the forces of a carry against payload mass, at unchanged timing."""
+    """Return the contact forces of a carry against payload mass, at unchanged timing."""
     cell = carry.workcell
     limited = limited_force(cell, carry.peak_normal_force, carry.peak_resultant_force)
     return PayloadSensitivity(cell.payload.mass, limited, mass_at_reference(cell, limited))
@@ -98,10 +101,15 @@ def payload_sensitivity(carry: Carry) -> PayloadSensitivity:
 def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
     """Compute the largest errors of friction, centre of mass and patch size that a carry tolerates.
 
-    Motion and timing stay the same. For the changed values the forces are computed anew, so the
+    Motion and timing stay the same. For each changed value the forces are computed anew, so the
     robots squeeze as hard as necessary. The carry fails if a normal force exceeds its reference
-    force, a centre of pressure leaves its patch, or a joint torque exceeds its maximum. A pad with
-    uniform pressure has no margin of its patch, but one until its rim lifts off.
+    force, a centre of pressure leaves its patch, or a joint torque exceeds its maximum. For a pad
+    with uniform pressure the result has no patch size, but how far the centre of pressure may shift
+    until the pad's rim lifts off.
+
+    Args:
+        model: timing model of the workcell.
+        carry: the carry.
     """
     workcell = model.workcell
     payload, contacts, task = workcell.payload, workcell.contacts, workcell.task
@@ -113,7 +121,8 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
     has_patches = model.carry_limits.has_pressure_limit
 
     def failure(friction: Array, centre: Array) -> str:
-        """Return the name of the most exceeded limit; '' if no limit is exceeded."""
+        """Return the name of the most exceeded limit with friction coefficients (2,) and a centre
+        of mass (3,) in the box frame [m]; '' if no limit is exceeded."""
         load = model.uncertain_load(carry, friction, centre)
         torque = model.contact_torque(wrench_torque, load) + own_torque
         use = {
@@ -128,8 +137,8 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
         return "" if use[name] <= 1.0 else name
 
     def lowered(whose: str, which: Array) -> Margin:
-        """Return the margin of the friction coefficients marked by `which` (2,), lowered by the
-        same share."""
+        """Return the margin of the friction at the contacts marked by 1 in `which` (2,), lowered by
+        one share, with the contacts' name `whose`."""
         nominal = float(friction[which > 0.0].min())
         lost, fails = _largest_feasible_change(
             lambda lost: failure(friction * (1.0 - lost * which), centre),
@@ -138,8 +147,8 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
         return Margin(f"friction of {whose}", "", nominal, nominal * (1.0 - lost), fails)
 
     def shifted(axis: int, sign: float) -> Margin:
-        """Return the margin of the centre of mass along one box axis, at most to the box's
-        faces."""
+        """Return the margin of the centre of mass along box axis 0, 1 or 2 in the direction of
+        `sign`, at most to the box's face."""
         nominal, direction = float(centre[axis]), sign * np.eye(3)[axis]
         offset, fails = _largest_feasible_change(
             lambda offset: failure(friction, centre + offset * direction),
@@ -164,9 +173,11 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
 
 
 def _even_margins(model: TimingModel, carry: Carry) -> list[Margin]:
-    """Return for each elastic pad how far its centre of pressure may still shift before a rim lifts
-    off [m], measured at the largest shift of the carry. Without any shift this is the whole free
-    shift."""
+    """Compute for each elastic pad how far its centre of pressure may shift further until a rim
+    lifts off [m].
+
+    The shift starts from the largest one of the carry. Other contact models give an empty list.
+    """
     workcell = model.workcell
     if not contact_model(workcell).has_elastic_layers:
         return []
@@ -188,9 +199,16 @@ def _even_margins(model: TimingModel, carry: Carry) -> list[Margin]:
 
 
 def _largest_feasible_change(failure: Callable[[float], str], end: float) -> tuple[float, str]:
-    """Return the largest change in [0, end] before the first failure, and the name of that failure.
+    """Find the largest change before the first failure.
 
     A scan brackets the first failure, so that a later recovery does not hide it.
+
+    Args:
+        failure: function from a change to the name of what fails, '' if nothing fails.
+        end: largest change that is tried; the smallest is 0.
+
+    Returns:
+        The change, and the name of the failure beyond it, '' if nothing fails up to `end`.
     """
     fails = failure(0.0)
     if fails:
@@ -232,7 +250,11 @@ class TimingSensitivity:
     """
 
     def __init__(self, model: TimingModel, timing: Timing) -> None:
-        """Linearise the limits that a timing of `time_path` nearly uses.
+        """Linearise the limits that a timing nearly uses.
+
+        Args:
+            model: timing model of the workcell, with as many intervals as the timing.
+            timing: fastest timing of a path, by `time_path`.
 
         Raises:
             SettingsError: there is no timing, or the timing is not the fastest.
@@ -274,15 +296,15 @@ class TimingSensitivity:
             )
 
     def changes(self, low: dict[str, Array], high: dict[str, Array]) -> tuple[float, float]:
-        """Compute the changes of the shortest duration [s] if a parameter of the workcell changes.
+        """Compute how the shortest duration changes with a parameter of the workcell.
 
         Args:
-            low, high: ratios of all limits at `speeds`, for the workcell with the parameter lowered
-                and raised by the same amount.
+            low, high: result of `CarryLimits.ratios` at `speeds`, for the workcell with the
+                parameter lowered and raised by the same amount.
 
         Returns:
-            Change of the duration with the parameter raised, and with it lowered; NaN if no timing
-            nearby satisfies the limits.
+            Change of the duration [s] with the parameter raised, and with it lowered; NaN if no
+            timing nearby satisfies the limits.
         """
         more = (self._select_used(high) - self._select_used(low)) / 2.0
         largest = float(np.abs(more).max(initial=0.0))
@@ -300,8 +322,8 @@ class TimingSensitivity:
         return np.concatenate([ratios[name][places] for name, places in self._used.items()])
 
     def _least_change(self, left: Array) -> float:
-        """Return the smallest change of the duration [s] that the slacks (m,) of the limits
-        allow."""
+        """Return the smallest change of the duration [s] (negative if it falls) that the slacks
+        `left` (m,) of m limits allow; NaN if none is possible."""
         found = linprog(
             self._slope,
             A_ub=self._matrix,

@@ -47,15 +47,17 @@ def time_path(
     limits: TimingLimits | None = None,
     motion: PathMotion | None = None,
 ) -> Timing:
-    """Compute the fastest timing from rest to rest within the workcell's and the given limits.
+    """Compute the fastest timing from rest to rest within the workcell's limits and additional
+    ones.
 
-    The compiled passes compute it; limits that they do not support are left to `topp_ra`, which is
-    many times slower. The timing is checked on a finer grid, and slowed down uniformly if it
-    exceeds a limit there.
+    The compiled passes compute it. Limits that they do not support are left to
+    `hybrid_opt.timing.topp_ra`, which is many times slower. The timing is checked on a finer grid,
+    and slowed down uniformly if it exceeds a limit there.
 
     Args:
+        model: timing model of the workcell.
         x: (n_var,) decision vector, or only its free waypoints (n_path,).
-        limits: limits in addition to the workcell's; None for joint torques and contact patches.
+        limits: additional limits; None limits joint torques and pressure shifts.
         motion: geometry of the path; computed if None.
 
     Raises:
@@ -137,7 +139,14 @@ def validate_timing(model: TimingModel, timing: Timing) -> Validation:
 def _slow_down(
     model: TimingModel, motion: PathMotion, limits: TimingLimits, found: PathTiming
 ) -> Timing:
-    """Recompute a timing on refined samples; slow it down uniformly if it exceeds a limit there."""
+    """Check a timing on a finer grid, and slow it down uniformly if it exceeds a limit there.
+
+    Args:
+        model: timing model of the workcell.
+        motion: geometry of the path.
+        limits: limits in addition to the workcell's.
+        found: timing by the passes or by TOPP-RA.
+    """
 
     @cache
     def driven(factor: float) -> Timing:
@@ -182,12 +191,14 @@ def check_limits(
     """Compute the utilisation of every limit by a carry.
 
     Args:
+        model: timing model of the workcell.
+        carry: the carry.
         limits: limits in addition to the workcell's.
         ratios: result of `CarryLimits.ratios`; computed if None.
 
     Returns:
-        Timing with the carry and the utilisations. Its status is always `OK`; the caller judges the
-        utilisations.
+        Timing with the carry and the utilisations. Its status is always `OK`, even if a limit is
+        exceeded.
     """
     ratios = model.carry_limits.ratios(carry, limits) if ratios is None else ratios
     use = dict[str, Utilisation]()
@@ -202,9 +213,12 @@ def check_limits(
 
 
 def joint_use(carry: Carry) -> dict[str, Array]:
-    """Return the largest utilisation of every joint over the carry, (all joints,) by name of the
-    joint limit. The entry `contact torque` is the part of the torque that exerts the contact
-    wrench."""
+    """Compute the largest utilisation of every joint over a carry.
+
+    Returns:
+        Arrays (all joints,) by name of the joint limit. The entry `contact torque` is the torque
+        that exerts the contact wrench, over the limit of the whole torque.
+    """
     limits = CarryLimits(carry.workcell)
     ratios = limits.ratios(carry, TimingLimits())
     use = {name: ratios[name].max(axis=0) for name in PER_JOINT}
@@ -213,10 +227,10 @@ def joint_use(carry: Carry) -> dict[str, Array]:
 
 
 def largest_speed_factor(use: Callable[[float], float]) -> float:
-    """Return the largest factor on the speeds, at most one, at which no limit is exceeded.
+    """Return the largest factor on all speeds, at most one, at which no limit is exceeded.
 
     Args:
-        use: largest utilisation of any limit as a function of the factor.
+        use: function from a factor to the largest utilisation of any limit.
 
     Returns:
         The factor; one if the full speed exceeds no limit by more than `RECOMPUTED_TOLERANCE`.
@@ -241,8 +255,11 @@ def largest_speed_factor(use: Callable[[float], float]) -> float:
 
 
 def most_used(use: dict[str, Utilisation]) -> Utilisation:
-    """Return the largest utilisation. Friction, fully used by construction, counts only if it is
-    exceeded."""
+    """Return the largest of the utilisations.
+
+    That of friction is one by construction of the forces, so it counts only if friction is
+    exceeded.
+    """
     candidates = [
         excess
         for name, excess in use.items()

@@ -55,10 +55,13 @@ FORCE_SHARPNESS = 0.02
 
 @dataclass(frozen=True)
 class LinearLimits:
-    """k linear limits alpha u'' + beta u'^2 <= bound at each of n places, arrays (n, k).
+    """k linear limits alpha u'' + beta u'^2 <= bound at each of n places.
 
     A place is a point of the path, or an interval. For an interval, u'' is its constant path
     acceleration and u'^2 is taken at its beginning.
+
+    Attributes:
+        alpha, beta, bound: (n, k) coefficients and bounds.
     """
 
     alpha: Array
@@ -69,10 +72,12 @@ class LinearLimits:
 def toppra_timing(
     model: TimingModel, motion: PathMotion, limits: TimingLimits
 ) -> PathTiming | Timing:
-    """Compute the fastest timing by a sequence of TOPP-RA's linear programs.
+    """Compute the fastest timing of a path by a sequence of TOPP-RA's linear programs.
 
     Args:
+        model: timing model of the workcell.
         motion: geometry of a path that both arms follow and on which no limit is exceeded at rest.
+        limits: limits in addition to the workcell's.
 
     Returns:
         The timing, not yet checked on the finer grid, or the solver's failure.
@@ -106,8 +111,11 @@ class _CuttingPlaneProblem:
         self._duration = np.inf
 
     def _first_rows(self) -> Iterator[LinearLimits]:
-        """Yield the linear limits, on speeds and on joint accelerations, and first supporting lines
-        of the convex limits, before any timing is known."""
+        """Yield the limits that are known before any timing is.
+
+        These are the linear limits on speeds and joint accelerations, and first supporting lines of
+        the convex limits.
+        """
         limit = squared_speed_limit(self._model, self._at.motion, self._limits)
         limit = np.minimum(limit, SPEED_CEILING / self._scale**2)[:, None]
         one, alpha, beta = np.ones_like(limit), *self._at.joint_accelerations()
@@ -150,8 +158,8 @@ class _CuttingPlaneProblem:
         )
 
     def _interval_rows(self, rows: list[LinearLimits]) -> LinearLimits:
-        """Express the rows at the points of each interval by u'' of the interval and u'^2 at its
-        beginning."""
+        """Convert limits at the points of each interval to limits on u'' of the interval and u'^2
+        at its beginning, in the scaled path coordinate."""
         alpha, beta, bound = (
             np.concatenate([getattr(row, name) for row in rows], axis=1)
             for name in ("alpha", "beta", "bound")
@@ -168,8 +176,12 @@ class _CuttingPlaneProblem:
         )
 
     def _at_points(self, squared: Array) -> tuple[Array, Array]:
-        """Return u'' and u'^2 (points,) of a timing, given as squared speeds (intervals + 1,) in
-        the scaled path coordinate."""
+        """Return u'' and u'^2 [1/s^2] of a timing at all points, (points,) each.
+
+        Args:
+            squared: (intervals + 1,) squared speeds at the grid points in the scaled path
+                coordinate.
+        """
         slope = np.diff(squared)
         w = squared[:-1, None] + np.outer(slope, INTERVAL_ENDS)
         a = np.repeat(slope / (2.0 * np.diff(self._grid)), len(INTERVAL_ENDS))
@@ -235,8 +247,14 @@ class _CuttingPlaneProblem:
         return worst_excess
 
     def _tighten(self, squared: Array) -> bool:
-        """Tighten the intervals that exceed a limit between their points. Return True if there are
-        any."""
+        """Tighten the limits of the intervals in which a timing exceeds a limit between the points.
+
+        Args:
+            squared: (intervals + 1,) squared speeds of the timing in the scaled path coordinate.
+
+        Returns:
+            True if there are any such intervals.
+        """
         ratios = self._model.carry_limits.ratios(self._refined(squared), self._limits)
         del ratios[FRICTION_RATIO]
         use = np.max([ratio.max(axis=1) for ratio in ratios.values()], axis=0)
@@ -268,10 +286,11 @@ class _CuttingPlaneProblem:
 
 
 def norm_rows(first: Array, second: Array, limit: float, directions: Array) -> LinearLimits:
-    """Return supporting lines of |first u'' + second u'^2| <= limit.
+    """Return supporting lines of the limit on the length of first u'' + second u'^2.
 
     Args:
-        first, second: (n, 3).
+        first, second: (n, 3) coefficient vectors at n points.
+        limit: largest allowed length.
         directions: (n, k, 3) unit vectors; each gives one line.
     """
     alpha = np.einsum("nkd,nd->nk", directions, first) / limit
@@ -280,29 +299,29 @@ def norm_rows(first: Array, second: Array, limit: float, directions: Array) -> L
 
 
 def tangent_rows(value: Array, gradient: Array, z: Array) -> LinearLimits:
-    """Return supporting lines of convex functions with limit one, tangent at z.
+    """Return tangents, at z, of k convex functions of (u'', u'^2) that may not exceed one.
 
     Args:
-        value: (n, k) values at z.
-        gradient: (n, k, 2) gradients at z by (u'', u'^2).
-        z: (n, 2) points (u'', u'^2).
+        value: (n, k) values of the functions at z.
+        gradient: (n, k, 2) their gradients at z by (u'', u'^2).
+        z: (n, 2) values of (u'', u'^2) at n points.
     """
     bound = 1.0 - value + np.einsum("nkd,nd->nk", gradient, z)
     return LinearLimits(gradient[..., 0], gradient[..., 1], bound)
 
 
 def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> LinearLimits:
-    """Linearise functions with limit one about z such that rest stays feasible.
+    """Linearise k functions of (u'', u'^2) that may not exceed one, such that rest stays feasible.
 
-    A tangent that forbids rest is replaced: it keeps its slope by u'', and by u'^2 it takes the
-    chord from z to rest. Raising the bound of the tangent instead would cut off nothing, not even
-    z.
+    They are linearised about z. A tangent that forbids rest is replaced: it keeps its slope by u'',
+    and by u'^2 it takes that of the chord from z to rest. Raising the tangent's bound in its place
+    would cut off nothing, not even z.
 
     Args:
-        value: (n, k) values at z.
-        gradient: (n, k, 2) gradients at z by (u'', u'^2).
-        at_rest: (n, k) values at u'' = u'^2 = 0, below one.
-        z: (n, 2) points (u'', u'^2).
+        value: (n, k) values of the functions at z.
+        gradient: (n, k, 2) their gradients at z by (u'', u'^2).
+        at_rest: (n, k) their values at u'' = u'^2 = 0, below one.
+        z: (n, 2) values of (u'', u'^2) at n points.
     """
     lines = tangent_rows(value, gradient, z)
     least = (1.0 - at_rest) / 2.0
@@ -337,7 +356,12 @@ and now and then call a feasible interval infeasible."""
 
 @dataclass(frozen=True)
 class SolverFailure:
-    """A failure of toppra: the reason, and the index of the interval."""
+    """A failure of toppra.
+
+    Attributes:
+        reason: what failed.
+        interval: index of the interval in which it failed.
+    """
 
     reason: str
     interval: int
@@ -347,11 +371,11 @@ def fastest_speed(rows: LinearLimits, grid: Array) -> Array | SolverFailure:
     """Compute the fastest motion from rest to rest within linear limits.
 
     Args:
-        rows: the linear limits by interval.
+        rows: the linear limits of each interval.
         grid: (intervals + 1,) increasing path coordinate, scaled so that speeds are around one.
 
     Returns:
-        (intervals + 1,) squared path speed at the grid points, zero at both ends, or a failure.
+        (intervals + 1,) squared path speeds at the grid points, zero at both ends; or a failure.
     """
     found: Array | SolverFailure = SolverFailure("not tried", 0)
     for factor in RESCALINGS:
