@@ -34,11 +34,15 @@ method stops a little inside."""
 
 
 def normalise(objectives: ArrayLike, ideal: ArrayLike, nadir: ArrayLike) -> Array:
-    """Map `ideal` to 0 and `nadir` to 1 in each objective, without clipping.
+    """Map `ideal` to 0 and `nadir` to 1 in each objective linearly, without clipping.
 
     Args:
-        objectives: (n, n_obj).
-        ideal, nadir: (n_obj,).
+        objectives: (n, n_obj) points.
+        ideal, nadir: (n_obj,) bounds of each objective, such as the best and worst values of a
+            front.
+
+    Returns:
+        (n, n_obj) normalised points.
 
     Raises:
         ValueError: nadir does not exceed ideal in every objective.
@@ -50,14 +54,14 @@ def normalise(objectives: ArrayLike, ideal: ArrayLike, nadir: ArrayLike) -> Arra
 
 
 def non_dominated(objectives: ArrayLike, feasible: ArrayLike | None = None) -> Mask:
-    """Return a mask (n,) of the feasible points that no feasible point dominates.
+    """Return a mask (n,) of the feasible points that no other feasible point dominates.
 
-    Of equal points the first is kept. A point with a NaN or infinite objective is never in the
-    mask.
+    Of equal points only the first is marked. A point with a NaN or infinite objective is never
+    marked.
 
     Args:
-        objectives: (n, n_obj).
-        feasible: (n,) bool, None if all are feasible.
+        objectives: (n, n_obj) points.
+        feasible: (n,) True for feasible points; None if all are feasible.
     """
     import moocore
 
@@ -73,8 +77,13 @@ def non_dominated(objectives: ArrayLike, feasible: ArrayLike | None = None) -> M
 
 
 def front_rows(objectives: ArrayLike, feasible: ArrayLike | None = None) -> NDArray[np.intp]:
-    """Return the row indices (k,) of the non-dominated feasible points, ordered by their
-    objectives."""
+    """Return the row indices (k,) of the non-dominated feasible points, sorted by first objective,
+    then by the next ones.
+
+    Args:
+        objectives: (n, n_obj) points.
+        feasible: (n,) True for feasible points; None if all are feasible.
+    """
     values = np.asarray(objectives, dtype=np.float64)
     rows = np.flatnonzero(non_dominated(values, feasible))
     return rows[np.lexsort(values[rows].T[::-1])]
@@ -87,15 +96,24 @@ def reference_point(n_obj: int) -> tuple[float, ...]:
 
 def front_of(objectives: ArrayLike, feasible: ArrayLike | None = None) -> Array:
     """Return the objectives (k, n_obj) of the non-dominated feasible points, by increasing first
-    objective."""
+    objective.
+
+    Args:
+        objectives: (n, n_obj) points.
+        feasible: (n,) True for feasible points; None if all are feasible.
+    """
     values = np.asarray(objectives, dtype=np.float64)
     return np.asarray(values[front_rows(values, feasible)])
 
 
 def hypervolume(front: ArrayLike, reference: ArrayLike = REFERENCE_POINT) -> float:
-    """Compute the volume that a front dominates up to the reference point; 0 for an empty front.
+    """Compute the volume of objective space that a front dominates up to a reference point.
 
     Source: Zitzler and Thiele 1999; computed by moocore (Fonseca et al. 2006).
+
+    Args:
+        front: (n, n_obj) objectives; the volume is 0 for n = 0.
+        reference: (n_obj,) reference point.
     """
     import moocore
 
@@ -106,20 +124,29 @@ def hypervolume(front: ArrayLike, reference: ArrayLike = REFERENCE_POINT) -> flo
 
 
 def igd(front: ArrayLike, reference_front: ArrayLike) -> float:
-    """Compute the inverted generational distance: mean Euclidean distance from each reference point
-    to the nearest point of the front; infinite for an empty front.
+    """Compute the inverted generational distance (IGD) of a front.
 
-    Source: Coello Coello and Reyes Sierra 2004, with the mean of distances (not the root of
-    their squared sum).
+    It is the mean Euclidean distance from each point of a reference front to the nearest point of
+    the front; infinite for an empty front. Source: Coello Coello and Reyes Sierra 2004, with the
+    mean of distances (not the root of their squared sum).
+
+    Args:
+        front: (n, n_obj) objectives.
+        reference_front: (k, n_obj) objectives of the best known front.
     """
     return _mean_distance("igd", front, reference_front)
 
 
 def igd_plus(front: ArrayLike, reference_front: ArrayLike) -> float:
-    """Compute IGD+: IGD with distances over only those objectives in which the front is worse than
-    the reference point. It is weakly Pareto compliant; infinite for an empty front.
+    """Compute IGD+ of a front: like IGD, but distances count only the objectives in which the point
+    of the front is worse than the point of the reference front.
 
-    Source: Ishibuchi, Masuda, Tanigaki and Nojima 2015.
+    It is weakly Pareto compliant; infinite for an empty front. Source: Ishibuchi, Masuda, Tanigaki
+    and Nojima 2015.
+
+    Args:
+        front: (n, n_obj) objectives.
+        reference_front: (k, n_obj) objectives of the best known front.
     """
     return _mean_distance("igd_plus", front, reference_front)
 
@@ -134,11 +161,15 @@ def _mean_distance(of_moocore: str, front: ArrayLike, reference_front: ArrayLike
 
 
 def spacing(front: ArrayLike) -> float:
-    """Compute the standard deviation (divisor n - 1) of each point's L1 distance to its nearest
-    neighbour. 0 means even spacing.
+    """Compute the standard deviation of each point's L1 distance to its nearest neighbour on a
+    front.
 
-    NaN for fewer than three points: one point has no neighbour, and two are always evenly spaced.
-    Spacing says nothing about convergence or extent, so do not use it alone. Source: Schott 1995.
+    The divisor is n - 1; 0 means even spacing. NaN for fewer than three points: one point has no
+    neighbour, and two are always evenly spaced. Spacing says nothing about convergence or extent,
+    so do not use it alone. Source: Schott 1995.
+
+    Args:
+        front: (n, n_obj) objectives.
     """
     from scipy.spatial import cKDTree
 
@@ -161,10 +192,16 @@ def feasible_share(feasible: ArrayLike) -> float:
 
 
 def best_so_far(objectives: ArrayLike, feasible: ArrayLike) -> Array:
-    """Compute the least feasible value (n, n_obj) of each objective up to each evaluation.
+    """Compute the least value of each objective over the feasible points up to each evaluation.
 
-    The value is NaN before the first feasible point. The minima of different objectives may belong
-    to different points.
+    Minima of different objectives may belong to different points.
+
+    Args:
+        objectives: (n, n_obj) points in the order of evaluation.
+        feasible: (n,) True for feasible points.
+
+    Returns:
+        (n, n_obj) least values; NaN before the first feasible point.
     """
     values = np.asarray(objectives, dtype=np.float64)
     usable = np.asarray(feasible, dtype=bool) & np.isfinite(values).all(axis=1)
@@ -173,11 +210,14 @@ def best_so_far(objectives: ArrayLike, feasible: ArrayLike) -> Array:
 
 
 def excess_above_static(objectives: ArrayLike, static: ArrayLike) -> Array:
-    """Compute the excess of peak forces over those of the static hold, in percent.
+    """Compute by how many percent peak normal forces exceed the normal forces at rest.
 
     Args:
-        objectives: (..., n_obj) normalised peak normal forces.
-        static: (n_obj,) or scalar, normalised normal forces at rest, positive.
+        objectives: (..., n_obj) peak normal forces over the reference forces.
+        static: (n_obj,) or scalar, normal forces at rest over the reference forces, positive.
+
+    Returns:
+        (..., n_obj) excess [%].
     """
     ratio = np.asarray(objectives, dtype=np.float64) / np.asarray(static, dtype=np.float64)
     return np.asarray(100.0 * (ratio - 1.0))
@@ -204,10 +244,17 @@ class BindingBound:
 
 
 def binding_bounds(task: Task, x: Array) -> tuple[BindingBound, ...]:
-    """Return the bounds that decision vectors (k, n_var) lie on, in the order of the variables.
+    """Find the bounds of decision variables that solutions lie on.
 
     Variables with equal bounds are left out, since they have no range. The bounds of the force
     limit are left out too: a front naturally ends at the force at rest and at the robots' limit.
+
+    Args:
+        task: task that defines the variables and their bounds.
+        x: (k, n_var) decision vectors of the solutions.
+
+    Returns:
+        The bounds with at least one solution, in the order of the variables.
     """
     x = np.asarray(x, dtype=float).reshape(-1, task.n_var)
     width = task.upper - task.lower

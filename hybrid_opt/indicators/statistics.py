@@ -24,7 +24,7 @@ Magnitude = Literal["negligible", "small", "medium", "large"]
 
 @dataclass(frozen=True)
 class Summary:
-    """Summary of one figure over replicas. NaN and infinite values are counted and left out.
+    """Summary of one figure over the replicas of a campaign. NaN and infinite values are left out.
 
     Attributes:
         count: number of finite values.
@@ -88,15 +88,15 @@ class RankTest:
 def rank_test(
     first: ArrayLike, second: ArrayLike, names: tuple[str, str] = ("first", "second")
 ) -> RankTest:
-    """Compare two samples without assuming a distribution.
+    """Compare two independent samples by Mann-Whitney's rank test, which assumes no distribution.
 
     The p-value is exact, also with ties. Sources: Mann and Whitney 1947; with ties the exact
-    permutation distribution of the midrank sum (Streitberg and Roehmel 1986); Vargha and
-    Delaney 2000 for the effect size.
+    permutation distribution of the midrank sum (Streitberg and Roehmel 1986); Vargha and Delaney
+    2000 for the effect size.
 
     Args:
-        first, second: (n,), (m,) values; NaN are left out.
-        names: names of the samples.
+        first, second: (n,) and (m,) values; NaN are left out.
+        names: names of both samples.
     """
     # Not imported at the top: it takes half a second, and the workers of a study rank nothing.
     from scipy.stats import mannwhitneyu, rankdata
@@ -116,7 +116,7 @@ def rank_test(
 
 
 def magnitude_of(a12: float) -> Magnitude:
-    """Return Vargha and Delaney's (2000) word for an effect size."""
+    """Return Vargha and Delaney's (2000) word for the effect size `a12`, such as 'small'."""
     effect = abs(a12 - 0.5)
     # The limits 0.56, 0.64, 0.71 are two-decimal figures; the margin keeps them inclusive.
     for limit, word in ((0.21, "large"), (0.14, "medium"), (0.06, "small")):
@@ -143,7 +143,7 @@ def holm(p_values: Sequence[float]) -> tuple[float, ...]:
 
 
 def corrected(tests: Sequence[RankTest]) -> tuple[RankTest, ...]:
-    """Return the tests of one family with `p_holm` set by Holm's correction."""
+    """Return rank tests with `p_holm` set by Holm's correction over all of them."""
     adjusted = holm([test.p for test in tests])
     return tuple(replace(test, p_holm=p_holm) for test, p_holm in zip(tests, adjusted, strict=True))
 
@@ -160,10 +160,14 @@ def _ranked(values: ArrayLike) -> Array:
 
 
 def _exact_with_ties(ranks: Array, count: int) -> tuple[float, float]:
-    """Compute U and the two-sided p-value of the first `count` midranks, over all ways to choose as
-    many.
+    """Compute Mann-Whitney's U and its exact two-sided p-value.
 
-    Counts the subsets of each size by the sum of their doubled (hence whole) midranks.
+    The distribution is over all choices of `count` out of the midranks. It is found by counting the
+    subsets of each size by the sum of their doubled (hence whole) midranks.
+
+    Args:
+        ranks: midranks of all values, those of the first sample first.
+        count: size of the first sample.
     """
     doubled = np.rint(2.0 * ranks).astype(np.int64)
     total = int(doubled.sum())
@@ -184,17 +188,16 @@ def attainment_surfaces(
 ) -> dict[float, Array]:
     """Compute the attainment surfaces of replicas' fronts.
 
-    A surface of percentile p bounds the points that at least p percent of the fronts attain: the
-    least number of fronts that makes up p percent. It is given by its corners, by increasing first
-    objective. It has no corners if fewer fronts than that hold any point. An empty front counts as
-    a replica that attains nothing.
+    The surface of percentile p bounds the region of objectives that at least p percent of the
+    fronts attain (dominate or touch). An empty front counts as a replica that attains nothing.
 
     Args:
         fronts: one (k_i, n_obj) front per replica, n_obj 2 or 3.
-        percentiles: in (0, 100].
+        percentiles: percentiles in (0, 100].
 
     Returns:
-        Corners (k, n_obj) by percentile.
+        By percentile the corners (k, n_obj) of the surface, by increasing first objective. There
+        are none if too few fronts hold any point.
 
     Raises:
         SettingsError: no fronts, or a percentile out of range.

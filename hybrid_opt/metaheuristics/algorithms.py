@@ -40,12 +40,12 @@ def violation_of(objectives: Array, constraints: Array) -> Array:
     """Compute the total constraint violation of evaluated points.
 
     Args:
-        objectives: (n, n_obj).
-        constraints: (n, n_con), satisfied where <= 0; n_con may be 0.
+        objectives: (n, n_obj) objectives.
+        constraints: (n, n_con) constraint values, satisfied where <= 0; n_con may be 0.
 
     Returns:
-        (n,) sum of the positive constraint values: 0 if feasible; infinite if an objective or a
-        constraint is not a finite number below `WORST_OBJECTIVE`.
+        (n,) sum of the positive constraint values, 0 if feasible; infinite if any objective or
+        constraint is NaN, infinite or at least `WORST_OBJECTIVE`.
     """
     total = np.maximum(constraints, 0.0).sum(axis=1)
     sound = (np.abs(objectives) < WORST_OBJECTIVE).all(axis=1) & np.isfinite(constraints).all(
@@ -65,13 +65,14 @@ def feasible_front(points: Population) -> Population:
 
 
 class Guarded(Algorithm):  # type: ignore[misc]
-    """Mixin that gives a pymoo algorithm an exact budget and finite fronts. List it before the
-    algorithm among the base classes.
+    """Mixin that gives a pymoo algorithm an exact number of evaluations and finite fronts.
+
+    List it before the algorithm among the base classes.
 
     - The last generation is cut so that exactly the evaluations of an `n_eval` termination are
-    spent, for every population size. - A point with a NaN or infinite objective or constraint
-    counts as infinitely infeasible, also on a problem without constraints. It loses every
-    comparison and enters no front.
+      spent, for every population size.
+    - A point with a NaN or infinite objective or constraint counts as infinitely infeasible, also
+      on a problem without constraints. It loses every comparison and enters no front.
     """
 
     def _setup(self, problem: Problem, **kwargs: Any) -> None:
@@ -92,15 +93,22 @@ class Guarded(Algorithm):  # type: ignore[misc]
         return None
 
     def infill(self) -> Population:
-        """Return the next candidates, at most as many as the remaining budget."""
+        """Return the next candidates to evaluate, at most as many as evaluations are left."""
         candidates = super().infill()
         if self.budget is None:
             return candidates
         return candidates[: max(self.budget - self.evaluator.n_eval, 0)]
 
     def advance(self, infills: Population | None = None, **kwargs: Any) -> Any:
-        """Take evaluated candidates; those with values that are not finite become infeasible
-        first."""
+        """Take evaluated candidates into the population.
+
+        Candidates with an objective or constraint that is not finite are marked as infeasible
+        before.
+
+        Args:
+            infills: evaluated candidates of the last `infill`.
+            kwargs: passed on to pymoo.
+        """
         if infills is not None and len(infills) > 0:
             objectives, constraints = infills.get("F", "G")
             violation = violation_of(objectives, constraints)
@@ -117,8 +125,8 @@ class Guarded(Algorithm):  # type: ignore[misc]
 
 
 class WarmSampling(FloatRandomSampling):  # type: ignore[misc]
-    """Initial population of uniform samples within the bounds, the first of them replaced by given
-    points."""
+    """Initial population of uniform samples within the bounds, of which the first are replaced by
+    given points."""
 
     def __init__(self, initial: Array | None = None) -> None:
         super().__init__()
@@ -211,9 +219,11 @@ class GuardedNsga2(Guarded, NSGA2):  # type: ignore[misc]
 
 
 class GuardedSmsEmoa(Guarded, SMSEMOA):  # type: ignore[misc]
-    """SMS-EMOA (Beume et al. 2007) of pymoo with the guarantees of `Guarded`. It makes a whole
-    generation of offspring at a time, and prefers feasible points if the problem has
-    constraints."""
+    """SMS-EMOA (Beume et al. 2007) of pymoo with the guarantees of `Guarded`.
+
+    It makes a whole generation of offspring at a time. If the problem has constraints, it prefers
+    feasible points.
+    """
 
 
 def genetic(
@@ -223,9 +233,10 @@ def genetic(
 
     Args:
         kind: class of the algorithm.
-        compare: function that decides a tournament.
+        compare: pymoo's comparison function, which decides a tournament.
         settings: settings of the algorithm.
-        initial: (k, n_var) decision vectors of the first generation; None for all random.
+        initial: (k, n_var) decision vectors that the first generation starts with, the rest being
+            uniformly random; None for all random.
     """
     mating = ExhaustiveMating(
         TournamentSelection(func_comp=compare),

@@ -31,16 +31,18 @@ Pull = Annotated[float, Range(0.0, 4.0)]
 class MopsoSettings:
     """Settings of MOPSO; the defaults except the swarm are those of the 2002 and 2004 papers.
 
-    Constriction coefficients (inertia 0.7298, both pulls 1.496) are far worse at 1000 evaluations
-    (shifted ZDT1: IGD 0.91).
+    Constriction coefficients (inertia 0.7298, cognitive and social 1.496) are far worse at 1000
+    evaluations (shifted ZDT1: IGD 0.91).
 
     Attributes:
         swarm: number of particles.
         archive: capacity of the external archive.
-        divisions: number of hypercubes per objective.
-        inertia, cognitive, social: factors of the old velocity, of the pull towards the personal
-            best, and of the pull towards the leader.
-        mutation_share: share of the run over which the turbulence fades to zero.
+        divisions: number of intervals per objective in the grid of hypercubes.
+        inertia: factor on a particle's old velocity.
+        cognitive: factor on its pull towards its personal best.
+        social: factor on its pull towards a leader from the archive.
+        mutation_share: share of the run over which the turbulence (random displacement) fades to
+            zero.
         horizon: number of evaluations of the whole run; None to take it from the termination.
     """
 
@@ -58,14 +60,14 @@ class MopsoSettings:
 
 
 def hypercubes(objectives: Array, divisions: int) -> Indices:
-    """Assign each point to a hypercube of the grid that the points themselves span.
+    """Assign each point to a hypercube of a grid in objective space that spans all points.
 
     Args:
-        objectives: (n, n_obj), finite.
-        divisions: number of cells per objective between the least and the greatest value.
+        objectives: (n, n_obj) points, finite.
+        divisions: number of intervals per objective between the least and the greatest value.
 
     Returns:
-        (n,) number of each point's hypercube. Only occupied cubes have numbers, from 0, in no
+        (n,) number of each point's hypercube. Only occupied hypercubes have numbers, from 0, in no
         particular order.
     """
     lowest = objectives.min(axis=0)
@@ -81,13 +83,13 @@ def thin(
 ) -> Indices:
     """Choose the members that stay if the archive is over capacity.
 
-    Removing a member from a fullest cube again and again levels all cubes to a common height. One
-    sort gives the same outcome. Stack the members of each cube: old members below newcomers (the
-    papers refuse a newcomer to a fullest cube), otherwise in random order. Then keep the lowest
-    members of all stacks; at equal height old members first, otherwise at random.
+    Members are taken from the fullest hypercubes until all are levelled to a common height.
+    Newcomers go before old members (the papers refuse a newcomer to a fullest hypercube), otherwise
+    chance decides. One sort does this: the members of each hypercube are stacked, and the lowest
+    members of all stacks stay.
 
     Args:
-        cubes: (n,) cube number of each member.
+        cubes: (n,) hypercube number of each member.
         newcomer: (n,) True for members that were not in the archive before.
         capacity: number of members that may stay.
         rng: source of randomness.
@@ -107,15 +109,15 @@ def thin(
 
 
 class HypercubeArchive:
-    """Archive of at most `capacity` non-dominated points.
+    """Archive of at most `capacity` non-dominated feasible points.
 
     As long as no feasible point is known, it holds the points of least violation as guides. The
     first feasible point replaces them.
 
     Attributes:
-        decisions: (n, n_var).
-        objectives: (n, n_obj).
-        violation: (n,) 0 if feasible, otherwise the common least violation.
+        decisions: (n, n_var) decision vectors.
+        objectives: (n, n_obj) objectives.
+        violation: (n,) total constraint violation: 0 if feasible, otherwise the least known one.
     """
 
     def __init__(self, capacity: int, divisions: int, n_var: int, n_obj: int) -> None:
@@ -135,13 +137,14 @@ class HypercubeArchive:
         """Merge evaluated points into the archive.
 
         Args:
-            decisions: (n, n_var).
-            objectives: (n, n_obj); finite for every point with finite violation.
-            violation: (n,); points with infinite violation are refused.
+            decisions: (m, n_var) decision vectors.
+            objectives: (m, n_obj) objectives; finite for every point with finite violation.
+            violation: (m,) total constraint violations; points with infinite violation are refused.
             rng: source of randomness for thinning.
 
         Returns:
-            Indices of the present members among [old members, new points], in this order.
+            Indices of the members after the merge, counted in the list of the n old members
+            followed by the m new points.
         """
         all_decisions = np.concatenate([self.decisions, decisions])
         all_objectives = np.concatenate([self.objectives, objectives])
@@ -166,7 +169,8 @@ class HypercubeArchive:
         return members
 
     def leaders(self, count: int, rng: np.random.Generator) -> Indices:
-        """Draw indices (count,) of members as leaders; members of sparse cubes are preferred.
+        """Draw indices (count,) of members at random as leaders; members of sparse hypercubes are
+        preferred.
 
         The archive must not be empty.
         """
@@ -178,7 +182,16 @@ Mask = NDArray[np.bool_]
 
 
 def reflect(position: Array, velocity: Array, lower: Array, upper: Array) -> tuple[Array, Array]:
-    """Stop particles at the bounds and reverse the velocity components that crossed them."""
+    """Put particles outside the bounds on the bounds, and reverse the velocity components that
+    crossed.
+
+    Args:
+        position, velocity: (n, n_var) of n particles.
+        lower, upper: (n_var,) bounds.
+
+    Returns:
+        Positions and velocities (n, n_var).
+    """
     inside = np.clip(position, lower, upper)
     return inside, np.where(inside == position, velocity, -velocity)
 
@@ -189,9 +202,9 @@ def turbulence(
     """Displace one random coordinate of some particles.
 
     Args:
-        position: (n, n_var).
+        position: (n, n_var) positions.
         lower, upper: (n_var,) bounds.
-        strength: in [0, 1]. It is the probability that a particle is displaced, and the width of
+        strength: number in [0, 1]: the probability that a particle is displaced, and the width of
             the range of displacements as a share of the bounds' range.
         rng: source of randomness.
 
@@ -217,14 +230,14 @@ def replaces_best(
     best_violation: Array,
     rng: np.random.Generator,
 ) -> Mask:
-    """Return True for each particle whose new point becomes its personal best.
+    """Return a mask (n,) of the particles whose new point becomes their personal best.
 
     Less violation wins. At equal violation a dominating point wins and a dominated one loses;
     between incomparable points a fair coin decides.
 
     Args:
-        objectives, best_objectives: (n, n_obj).
-        violation, best_violation: (n,).
+        objectives, violation: (n, n_obj) and (n,) of the new points.
+        best_objectives, best_violation: (n, n_obj) and (n,) of the personal bests so far.
         rng: source of randomness.
     """
     coin = rng.random(len(violation)) < 0.5

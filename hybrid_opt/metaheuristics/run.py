@@ -64,7 +64,7 @@ REGISTRY: dict[str, _Entry] = {
 
 
 def names() -> tuple[str, ...]:
-    """Return the names that `make` accepts."""
+    """Return the names of the algorithms that `make` accepts."""
     return tuple(REGISTRY)
 
 
@@ -79,10 +79,10 @@ def title(name: str) -> str:
 
 
 def settings_of(name: str, overrides: Mapping[str, object] | None = None) -> AlgorithmSettings:
-    """Return the effective settings of an algorithm: its defaults with `overrides`.
+    """Return the settings of an algorithm: its defaults with some values replaced.
 
     Args:
-        name: one of `names()`.
+        name: name of the algorithm, one of `names()`.
         overrides: values by setting name that replace defaults; None for none.
 
     Raises:
@@ -112,14 +112,15 @@ def make(
     """Build a fresh algorithm for one run.
 
     Args:
-        name: one of `names()`.
+        name: name of the algorithm, one of `names()`.
         settings: settings object of the algorithm, or only the values that differ from the
             defaults, by setting name; None for the defaults.
-        initial: (k, n_var) decision vectors of the first generation. The rest of the first
-            generation is uniformly random. None for all random.
+        initial: (k, n_var) decision vectors that the first generation starts with, the rest being
+            uniformly random; None for all random.
 
     Raises:
-        SettingsError: as `settings_of`; wrong `initial` points are refused when the run starts.
+        SettingsError: unknown algorithm or setting, or a value outside its range. Wrong `initial`
+            points are refused when the run starts.
     """
     if is_dataclass(settings):
         settings = asdict(settings)
@@ -149,19 +150,22 @@ class Evaluator(Protocol):
     upper: Array
 
     def evaluate(self, x: Array) -> Evaluations:
-        """Evaluate decision vectors (n, n_var)."""
+        """Evaluate decision vectors x (n, n_var)."""
 
     def certified(self, evaluations: Evaluations) -> Evaluations:
-        """Return the evaluations with every member of the feasible front proven free of collisions
-        between samples."""
+        """Return the evaluations after a check for collisions between the samples.
+
+        Candidates that collide there become infeasible. Afterwards every member of the feasible
+        front is proven free of collisions.
+        """
 
 
 def reject_non_finite(evaluations: Evaluations) -> Evaluations:
-    """Return the evaluations with every candidate that has a non-finite figure marked as
+    """Return the evaluations, with every candidate that has a NaN or infinite figure made
     infeasible.
 
-    Such a candidate gets `WORST_PENALTY` and the reason `NOT_FINITE`. The plain objectives of
-    infeasible candidates may be non-finite.
+    Such a candidate gets `WORST_PENALTY` and the reason `NOT_FINITE`. Infeasible candidates may
+    have plain objectives that are not finite.
     """
     finite = np.isfinite(evaluations.violation).all(axis=1)
     finite &= np.isfinite(evaluations.violation_time).all(axis=1)
@@ -192,9 +196,11 @@ class CarryProblem(Problem):  # type: ignore[misc]
 
     Attributes:
         evaluator: evaluator of the candidates.
-        drawn: coarse task, whose decision vectors pymoo draws; None if equal to the evaluated task.
-        task: task of the evaluated candidates, resampled from `drawn`; None if `drawn` is None.
-        handling: 'penalty' or 'constraints', as above.
+        drawn: task with fewer waypoints whose decision vectors pymoo varies; None if pymoo varies
+            those of the evaluated task.
+        task: task of the evaluated candidates, to which the vectors of `drawn` are resampled; None
+            if `drawn` is None.
+        handling: 'penalty' or 'constraints'.
         evaluated: function called after each batch with the number of candidates in the batch.
         batches: evaluations of each batch, in order.
     """
@@ -210,10 +216,11 @@ class CarryProblem(Problem):  # type: ignore[misc]
 
         Args:
             evaluator: evaluator of the candidates.
-            handling: 'penalty' or 'constraints'.
+            handling: 'penalty' or 'constraints', see the class.
             evaluated: function called after each batch with the number of candidates in the batch.
-            task: task of the evaluated candidates. If its path has several pieces, pymoo draws
-                decision vectors of the coarse task only. None draws the evaluator's variables.
+            task: task of the evaluated candidates. If its path has several pieces between the
+                waypoints of the workcell file, pymoo varies only these waypoints. None varies the
+                evaluator's own variables.
         """
         self.task = task if task is not None and task.pieces > 1 else None
         self.drawn = None if self.task is None else coarse_task(self.task)
@@ -299,7 +306,7 @@ def search(
     evaluations: int,
     rng: np.random.Generator | int,
 ) -> SearchResult:
-    """Spend exactly `evaluations` evaluations of `problem`.
+    """Run an algorithm on a problem with an exact number of evaluations.
 
     Args:
         problem: pymoo problem with `elementwise=False`; each generation is one call.
@@ -309,7 +316,7 @@ def search(
             the bit.
 
     Raises:
-        SettingsError: no budget, or an algorithm that already ran.
+        SettingsError: fewer than one evaluation, or an algorithm that already ran.
     """
     if evaluations < 1:
         raise SettingsError(f"evaluations is {evaluations}; at least 1 is needed", code="budget")
@@ -349,9 +356,9 @@ class SearchSettings:
     """Settings of a search.
 
     Attributes:
-        algorithm: settings of the algorithm, `GeneticSettings` of NSGA-II and SMS-EMOA or
-            `MopsoSettings` of both MOPSO; or the values that differ from its defaults.
-        constraint_handling: 'penalty' (the paper's) or 'constraints'.
+        algorithm: settings object of the algorithm, or only the values that differ from its
+            defaults, by setting name.
+        constraint_handling: 'penalty' (the paper's) or 'constraints', see `CarryProblem`.
         initial: (k, n_var) decision vectors that the first generation starts with, the rest being
             uniformly random; None for what the caller starts from by default.
     """
@@ -373,7 +380,8 @@ def search_carries(
     evaluated: Callable[[int], None] = lambda count: None,
     task: Task | None = None,
 ) -> tuple[Evaluations, NDArray[np.intp]]:
-    """Search with exactly `evaluations` evaluations and certify the front of all candidates.
+    """Search with an exact number of evaluations, and certify the front of all evaluated
+    candidates.
 
     Args:
         evaluator: evaluator of the candidates.
@@ -382,8 +390,9 @@ def search_carries(
         rng: random generator of the whole run.
         settings: settings of the search.
         evaluated: function called after each batch with the number of candidates in the batch.
-        task: task of the candidates; with several path pieces only the coarse task's decision
-            vectors are drawn. None draws the evaluator's variables.
+        task: task of the candidates. If its path has several pieces between the waypoints of the
+            workcell file, only these waypoints are varied. None varies the evaluator's own
+            variables.
 
     Returns:
         The evaluations of all candidates in order, and the generation (n,) of each, from 1.
