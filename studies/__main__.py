@@ -20,8 +20,8 @@ START = "main.start()"
 
 
 def programs() -> dict[str, tuple[str, str]]:
-    """Return the module and the first sentence of every program's description, by the name of the
-    program."""
+    """Return for each program, by name, the full name of its module and the first sentence of its
+    description."""
     folder = Path(__file__).parent
     found = {}
     doors = ("*.py", "*/*.py", "*/*/__main__.py")
@@ -44,7 +44,7 @@ def main(arguments: Sequence[str] | None = None, called: str = "python -m studie
 
     Args:
         arguments: the arguments of the command line, None for those of this process.
-        called: how the command was called, for messages.
+        called: name under which this command was called, for messages.
     """
     known = programs()
     given = list(sys.argv[1:] if arguments is None else arguments)

@@ -57,12 +57,12 @@ def show(options: argparse.Namespace) -> int:
 
 
 def first_result(evaluations: int = QUICK_EVALUATIONS, seed: int = 1) -> Iterator[str]:
-    """Yield texts to print: first the limits that hold the rack's hand-made carry back, then a
-    first front of a short search.
+    """Yield texts to print: the limits that hold back the rack's hand-made carry, then the first
+    front of a short search.
 
     Args:
         evaluations: number of candidates of the search.
-        seed: of the search's random numbers.
+        seed: seed of the search's random numbers.
     """
     import numpy as np
 
@@ -100,8 +100,8 @@ def first_result(evaluations: int = QUICK_EVALUATIONS, seed: int = 1) -> Iterato
 
 
 def _held(timing: ho.Timing) -> str:
-    """Return the names of the limits that a timed carry uses fully, friction left out; the reason
-    of a failed timing."""
+    """Return the names of the limits that a timed carry uses fully, friction left out; if the
+    timing failed, the reason."""
     if not timing.ok:
         return timing.reason
     # The least forces always use the whole friction.

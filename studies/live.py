@@ -27,8 +27,9 @@ def _add_options(parser: Parser) -> None:
 
 
 def serve(options: argparse.Namespace) -> int:
-    """Serve a page on which a cell can be changed, until Ctrl-C. The first carry shown keeps within
-    the reference force if one is found. Return the exit code.
+    """Serve a page on which a cell can be changed, until Ctrl-C. Return the exit code.
+
+    The first carry shown keeps within the reference force, if one is found that does.
 
     Raises:
         DualArmError: the cell has no drivable form, or the package viser is not installed.

@@ -37,12 +37,14 @@ Number = TypeVar("Number", int, float)
 
 
 def whole(low: int, high: int) -> Callable[[str], int]:
-    """Return a type of options that takes integers in a range, ends included."""
+    """Return a function that converts the text of an option to an integer from `low` to `high`,
+    both included."""
     return _within(int, low, high, f"a whole number {low} to {high}")
 
 
 def number(low: float, high: float) -> Callable[[str], float]:
-    """Return a type of options that takes finite numbers in a range, ends included."""
+    """Return a function that converts the text of an option to a finite number from `low` to
+    `high`, both included."""
     return _within(float, low, high, f"a number {low:g} to {high:g}")
 
 
@@ -97,7 +99,7 @@ _SECTION = re.compile(rb"^\s*\[+\s*(task|payload|robots|contacts)\b", re.MULTILI
 
 
 def _kind_of(path: Path) -> str:
-    """Return the kind of a file or folder by its content; '' if unknown."""
+    """Return what a file or folder is, judged by its content; '' if unknown."""
     if path.is_dir():
         is_study = (path / stated("hybrid_opt.campaign.settings.CONFIGURATION")).exists()
         return RESULTS if is_study else "a folder"
@@ -112,8 +114,12 @@ def _kind_of(path: Path) -> str:
 
 
 def _require_file(path: Path, kind: str = "") -> None:
-    """Check that a path can be read as a file, and that its content is not of another kind than
-    `kind`."""
+    """Check that a path can be read as a file.
+
+    Args:
+        path: the path.
+        kind: expected kind of the file; a file that is recognised as another kind is refused.
+    """
     try:
         safe_io.require(path, safe_io.MOST_BYTES)
     except OutsideError as error:
@@ -124,7 +130,12 @@ def _require_file(path: Path, kind: str = "") -> None:
 
 
 def _expected(path: Path, kind: str) -> str:
-    """Return the end of a message: the expected kind of file and its usual place."""
+    """Return the end of a message: the expected kind of file and where such files usually are.
+
+    Args:
+        path: the unsuitable path.
+        kind: expected kind of the file.
+    """
     expected = f"; expected is {kind}" if kind else ""
     if not path.exists():
         folder = path.parent
@@ -299,7 +310,7 @@ def add(parser: argparse._ActionsContainer, *names: str, **own: Any) -> None:
     Args:
         parser: parser of the program.
         names: names in the table of options; positional arguments in capitals.
-        own: attributes that differ in this program.
+        own: attributes of the options, as for `add_argument`, that differ in this program.
     """
     for name in names:
         place = {} if name.startswith("-") else {"metavar": name}
@@ -307,7 +318,7 @@ def add(parser: argparse._ActionsContainer, *names: str, **own: Any) -> None:
 
 
 def add_wishes(parser: argparse._ActionsContainer) -> None:
-    """Add the options of a `Wish` for a recommended carry."""
+    """Add the options that say what a recommended carry should be best at (`Wish`)."""
     parser.add_argument(
         "--duration",
         type=force,

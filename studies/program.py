@@ -38,8 +38,8 @@ VERBOSE = "--verbose"
 
 
 class _Help(argparse.HelpFormatter):
-    """Formatter that states the default of every option unless the option's text does. Numbers are
-    shown as N."""
+    """Formatter of help texts. It adds the default of each option that does not state it, and shows
+    numbers as N."""
 
     def _get_default_metavar_for_optional(self, action: argparse.Action) -> str:
         if action.type is None or isinstance(action.type, PathType):
@@ -71,7 +71,7 @@ class _Help(argparse.HelpFormatter):
 
 
 class Parser(argparse.ArgumentParser):
-    """Parser that reports a mistake in one line, with a suggestion."""
+    """Parser of a command line that reports a mistake in one line, with a suggestion."""
 
     def __init__(self, *, prog: str, description: str | None, further: Sequence[str] = ()) -> None:
         """Prepare a parser that accepts no abbreviated options and states defaults in `--help`.
@@ -89,7 +89,7 @@ class Parser(argparse.ArgumentParser):
         self.add_argument("--help-all", action=_HelpAll, help=told)
 
     def format_usage(self) -> str:
-        """Return a usage line with the required arguments only; the help has the others."""
+        """Return a usage line with the required arguments only; the help lists all others."""
         formatter = self._get_formatter()
         words = [
             " ".join([*action.option_strings[:1], str(action.metavar or action.dest.upper())])
@@ -136,7 +136,7 @@ class Parser(argparse.ArgumentParser):
 
 
 class _HelpAll(argparse.Action):
-    """Action that explains every option."""
+    """Option that prints the help of all options."""
 
     def __init__(self, option_strings: Sequence[str], dest: str, help: str) -> None:
         nothing = argparse.SUPPRESS
@@ -149,7 +149,7 @@ class _HelpAll(argparse.Action):
 
 
 class _Version(argparse.Action):
-    """Action that looks up the version on request only."""
+    """Option that looks up and prints the version."""
 
     def __init__(self, option_strings: Sequence[str], dest: str, help: str) -> None:
         nothing = argparse.SUPPRESS
@@ -180,9 +180,9 @@ class Program:
         add_options: function that adds the program's options to a parser that already has
             `--verbose`.
         run: function that does the work with the parsed options and returns the exit code; or the
-            full name of such a function, which runs with libraries in one thread. The options also
-            have `called`, the name by which the program was called, and `arguments`, the words of
-            the command line.
+            full name of such a function, which is then imported and run with libraries in one
+            thread. The options also have `called`, the name by which the program was called, and
+            `arguments`, the words of the command line.
         interrupted: text after Ctrl-C.
         complete: function that derives paths from other options and checks the extras that the
             options need; called before paths are checked.
@@ -203,8 +203,11 @@ class Program:
         return f"studies.{self.name}"
 
     def parser(self, called: str = "") -> Parser:
-        """Return the parser of the program's options. `called` is the name in its usage line; ''
-        for `python -m`."""
+        """Return the parser of the program's options.
+
+        Args:
+            called: name of the program in the usage line; '' for `python -m` and the module.
+        """
         prog = called or f"python -m {self.module}"
         parser = Parser(prog=prog, description=self.description, further=self.further)
         self.add_options(parser)
@@ -231,7 +234,8 @@ class Program:
         return carry_out(parser.prog, work, self.interrupted)
 
     def start(self) -> NoReturn:
-        """Run the program as a separate process, and end the process."""
+        """Run the program as the main program of this process, and end the process with its exit
+        code."""
         sys.exit(run_program(self))
 
 
@@ -272,9 +276,12 @@ def load_workcell(path: Path) -> Workcell:
 def run_program(main: Callable[[], int]) -> int:
     """Run the main function of a program's process. Return the exit code.
 
-    Warnings of this project are printed once, on one line. Warnings of libraries (divisions by
-    zero, deprecations) are printed only with `--verbose`. The same holds in processes that this one
-    starts.
+    Each warning of this project is printed once, on one line. Warnings of libraries (divisions by
+    zero, deprecations) are printed only with `--verbose`. Processes that this one starts do
+    likewise.
+
+    Args:
+        main: function that does the program's work and returns the exit code.
     """
     _show_warnings(verbose=VERBOSE in sys.argv[1:])
     for stream in (sys.stdout, sys.stderr):
@@ -317,7 +324,8 @@ def _leave() -> None:
 
 
 def carry_out(program: str, work: Callable[[], int], interrupted: str = "interrupted") -> int:
-    """Do the work of a program. An error ends in one message and an exit code.
+    """Do the work of a program. If it raises an error, print one message and return the exit code
+    of that error.
 
     Args:
         program: name of the program, in front of the message.
@@ -370,7 +378,12 @@ class ProgramResult:
 
 
 def print_findings(findings: Iterable[ProgramResult], as_json: bool) -> None:
-    """Print each result as soon as it exists, or all at the end as one JSON object."""
+    """Print the results of a program.
+
+    Args:
+        findings: the results; each is printed as soon as it exists.
+        as_json: True to print all results at the end, as one JSON object.
+    """
     values: dict[str, Any] = {}
     for finding in findings:
         values |= finding.values

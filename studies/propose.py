@@ -140,11 +140,11 @@ def _next_command(options: argparse.Namespace) -> str:
 
 
 def _teller(worked: Callable[[], float]) -> Callable[[str], None]:
-    """Return a function that prints a text with the seconds worked so far, unless it is the text
-    printed last.
+    """Return a function that prints a text with the seconds worked so far, unless the last text was
+    the same.
 
     Args:
-        worked: returns the seconds worked so far.
+        worked: function that returns the seconds worked so far.
     """
     last = [""]
 

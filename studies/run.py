@@ -230,7 +230,7 @@ def study_of(workcell: Path, options: argparse.Namespace, with_paper: bool = Fal
 
     Args:
         workcell: path of the workcell file.
-        options: as parsed with the options of `add_options`.
+        options: options that were parsed with those of `add_options`.
         with_paper: whether tables have rows with the values that the paper states.
     """
     again = [part for part in options.arguments if part not in ("--resume", "--overwrite")]
@@ -268,8 +268,11 @@ def _add_options(parser: Parser) -> None:
 
 
 def complete(options: argparse.Namespace, name: str) -> None:
-    """Fill in the default results folder `results/NAME`, and check that the installed extras
-    suffice for the options.
+    """Set the results folder to `results/NAME` unless the options state one, and check that the
+    extras that the options need are installed.
+
+    Args:
+        name: name of the study.
 
     Raises:
         SettingsError: an extra is not installed.

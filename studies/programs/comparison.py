@@ -40,13 +40,14 @@ POLISHED_PREFIX = "polished_"
 
 @dataclass(frozen=True)
 class ComparedFigure:
-    """One figure of one algorithm in both campaigns.
+    """One figure of merit of one algorithm in two campaigns.
 
     Attributes:
         algorithm, figure: names of the algorithm and of the figure.
-        first, second: summary of the figure over the replicas of each campaign.
-        test: rank test between both campaigns; None for few replicas, or if one campaign has no
-            value.
+        first, second: summary of the figure over the replicas of the first and of the second
+            campaign.
+        test: rank test between both campaigns; None with few replicas, or if one campaign lacks the
+            figure.
     """
 
     algorithm: str
@@ -64,10 +65,11 @@ class CampaignComparison:
         runs: the two results folders.
         same_workcell: whether both campaigns searched the same cell. Figures of different cells say
             little about the algorithms.
-        differences: key of the configuration, first and second value.
-        figures: compared figures of the algorithms that both campaigns ran.
-        only: for each campaign the algorithms that the other lacks.
-        drivable: comparison of the drivable experiments; None if one campaign has no separate one.
+        differences: settings in which the campaigns differ: key, first value and second value.
+        figures: figures of the algorithms that both campaigns ran.
+        only: algorithms that only the first campaign ran, and those that only the second ran.
+        drivable: comparison of both studies' drivable experiments; None if a study has no separate
+            one.
     """
 
     runs: tuple[str, str]
@@ -135,8 +137,8 @@ def _algorithm_figures(
 def _values(
     run: CampaignResults, name: str, summary: CampaignSummary, reference: Array
 ) -> dict[str, list[float]]:
-    """Return the figures of an algorithm by name, one value per replica; figures of polished fronts
-    come last."""
+    """Return the figures of one algorithm by name, each as a list with one value per replica.
+    Figures of polished fronts come last."""
     stored = summary.algorithms[name].replicas
     better = [row.polished for row in stored if row.polished is not None]
     values: dict[str, list[float]] = {}
@@ -159,7 +161,8 @@ def _compared(name: str, figure: str, first: Array, second: Array) -> ComparedFi
 
 
 def _with_holm(figures: list[ComparedFigure]) -> tuple[ComparedFigure, ...]:
-    """Return the figures with their tests corrected as one family (Holm)."""
+    """Return the figures with the p-values of their rank tests corrected for multiple testing by
+    Holm's method."""
     tests = iter(corrected([figure.test for figure in figures if figure.test is not None]))
     return tuple(
         figure if figure.test is None else replace(figure, test=next(tests)) for figure in figures
@@ -207,7 +210,7 @@ def as_text(found: CampaignComparison) -> str:
 
 
 def _quantity(figure: str) -> tuple[str, Quantity]:
-    """Return the name and the format of a figure."""
+    """Return the name of a figure for people, and the format of its values."""
     quantity = REPLICA_QUANTITIES[figure.removeprefix(POLISHED_PREFIX)]
     of = "polished, " if figure.startswith(POLISHED_PREFIX) else ""
     return f"{of}{quantity.heading()}", quantity

@@ -37,12 +37,12 @@ of the resulting front."""
 
 @dataclass(frozen=True)
 class Optimum:
-    """Result of a short polish of the hand-made trajectory.
+    """Result of a short polish that starts at the hand-made trajectory.
 
     Attributes:
         solutions: number of solutions of the polished front.
-        binding: bounds that solutions lie on.
-        problem: reason why there is no polish, else ''.
+        binding: bounds of decision variables that solutions lie on.
+        problem: reason why no polish was possible, else ''.
     """
 
     solutions: int
@@ -61,7 +61,7 @@ def inspected(
     pairs: bool = False,
     progress: Progress | None = None,
 ) -> Iterator[ProgramResult]:
-    """Yield all findings about a cell, each computed on request.
+    """Yield all findings about a cell. Each is computed when it is requested.
 
     Args:
         candidates: number of random candidates, at least 1.
@@ -129,7 +129,8 @@ def inspected(
 
 
 def _at_rest(cell: Cell) -> ProgramResult:
-    """Compute the forces that hold the payload level and at rest, and whether it can be held."""
+    """Compute the normal forces that hold the level payload at rest, and whether the reference
+    forces allow them."""
     hold, static_hold_error = cell.static_hold, cell.static_hold_error
     force = hold.normal_force
     share = force / cell.workcell.task.reference_force
@@ -154,7 +155,7 @@ def _at_rest(cell: Cell) -> ProgramResult:
 
 
 def _postures(cell: Cell) -> ProgramResult:
-    """Return the postures at the start by robot, best first."""
+    """Return the postures with which each robot can hold the box at the start, best first."""
     robots = cell.workcell.robots
     found = cell.compiled.model.branches
     branches = {
@@ -169,8 +170,8 @@ def _postures(cell: Cell) -> ProgramResult:
 
 
 def _candidates(cell: Cell, count: int, seed: int) -> Iterator[ProgramResult]:
-    """Evaluate random candidates. Yield the number of feasible ones, and the obstacles of the
-    others."""
+    """Evaluate random candidates. Yield how many are feasible, then what makes the others
+    infeasible."""
     found = cell.evaluate(cell.random(count, np.random.default_rng(seed)))
     share, reasons = float(found.feasible.mean()), found.infeasible_by_reason
     lines = [
@@ -195,7 +196,7 @@ def _candidates(cell: Cell, count: int, seed: int) -> Iterator[ProgramResult]:
 
 
 def _meshes(workcell: Workcell) -> ProgramResult:
-    """Return the sizes of the meshes, and of their convex pieces, by file."""
+    """Return the size of each mesh file, and of the convex pieces that it is split into."""
     reader = MeshReader()
     collision_bodies(workcell, reader)
     sizes = {
@@ -218,7 +219,12 @@ def _meshes(workcell: Workcell) -> ProgramResult:
 
 
 def _pairs(cell: Cell, listed: bool) -> ProgramResult:
-    """Return the pairs of bodies that are checked, and the others with the reasons."""
+    """Return the pairs of bodies that are checked for collisions, and those that are not, with the
+    reasons.
+
+    Args:
+        listed: True to list every pair by name.
+    """
     geometry = cell.geometry
     names, active = [body.name for body in geometry.bodies], geometry.pair_names
     excluded = tuple((names[p.first], names[p.second], p.reason) for p in geometry.excluded)
@@ -280,12 +286,19 @@ def _vector(values: Array) -> str:
 
 @dataclass(frozen=True)
 class Branch:
-    """A posture of one arm at the start, with the least margins of the hand-made trajectory from
-    this posture (`symbolic.robot.branches.StartBranch`).
+    """A posture of one arm at the start (`symbolic.robot.branches.StartBranch`), with the smallest
+    margins along the hand-made trajectory from this posture.
 
-    The clearance is measured by FCL; it is 0 if bodies intersect and None if nothing can collide.
-    Sliding joints are in mm, others in degrees; `limit_margins` has the least distance to a limit
-    of either kind by its unit.
+    Attributes:
+        joints: joint positions of the posture, in the unit of each joint.
+        joint_units: 'deg' for turning and 'mm' for sliding joints.
+        kept_samples: number of samples of the trajectory that the arm can follow from this posture.
+        clearance_mm: least distance of the arm from other bodies [mm]; 0 if bodies intersect, None
+            if nothing can collide.
+        limit_margins: least distance of a joint from its limits, by unit.
+        manipulability: least manipulability along the trajectory [m^3].
+        least_manipulability: manipulability that the robot's description requires [m^3].
+        chosen: True if the cell uses this posture.
     """
 
     joints: tuple[float, ...]
@@ -317,8 +330,14 @@ def _branch(cell: Cell, arm: int, branch: StartBranch) -> Branch:
 
 
 def _clearance_mm(cell: Cell, arm: int, branch: StartBranch) -> float | None:
-    """Measure the least distance of one arm from all other bodies [mm] along the samples that it
-    keeps, by FCL."""
+    """Measure the least distance of one arm from all other bodies by FCL, along those samples of
+    the hand-made trajectory that it can follow from a start branch [mm]. None if no pair of bodies
+    includes the arm.
+
+    Args:
+        arm: index of the arm.
+        branch: the start branch.
+    """
     checker, kept = cell.evaluator.checker, max(branch.kept, 1)
     own = own_pairs(cell.geometry, arm)
     if not own:

@@ -32,9 +32,13 @@ def regenerate(options: argparse.Namespace) -> int:
 def _regenerated(
     cache: Cache, options: argparse.Namespace, found: list[Agreement]
 ) -> Iterator[ProgramResult]:
-    """Yield one result per action. Comparisons are added to `found`.
+    """Do what the options request, and yield one result per action.
 
     The workcell is read and its expressions are made before `--clean` removes anything.
+
+    Args:
+        cache: cache of compiled functions.
+        found: list to which comparisons of functions are added.
     """
     largest = largest_size()
     cell = (
@@ -94,7 +98,11 @@ def _built(
     options: argparse.Namespace,
     found: list[Agreement],
 ) -> Iterator[ProgramResult]:
-    """Compile the functions of the evaluator, and compare them with the interpreted ones."""
+    """Compile the functions of the evaluator, and compare them with their interpreted expressions.
+
+    Args:
+        found: list to which the comparisons are added.
+    """
     from symbolic.parameters import GROUPS
 
     task = cell.workcell.task

@@ -75,8 +75,9 @@ from symbolic.records import Workcell
 def simulate_arms(
     cell: Cell, carry: Carry, settings: ArmSettings, options: argparse.Namespace
 ) -> str:
-    """Find the threshold of a carry, simulate random cases, and print both. Return the cell as
-    MJCF.
+    """Simulate a carry with both arms and print the results: the least factor of the planned forces
+    that holds the box, the job with the commanded forces, and random cases of the uncertainty.
+    Return the simulated cell as MJCF.
 
     Raises:
         SimulationError: with --sweep, the box holds at the lower factor or slips at the upper
@@ -126,7 +127,12 @@ def _tell(outcome: ArmOutcome, carry: Carry) -> None:
 def _cases(
     cell: Cell, pressed: Reference, settings: ArmSettings, options: argparse.Namespace
 ) -> None:
-    """Simulate random cases with tracking errors under the robust force."""
+    """Simulate random cases of the uncertainty with errors of the joints, and print how many
+    arrive.
+
+    Args:
+        pressed: commands to both arms, with the normal forces of a job.
+    """
     workcell, rng, leader = cell.workcell, np.random.default_rng(options.seed), options.leader - 1
     control: Control = options.controller
     outcomes = []
@@ -145,7 +151,13 @@ def _cases(
 
 
 def tracked_share(case: Array, leader: int) -> float:
-    """Return the share of the commanded force that remains in a case."""
+    """Return the actual over the commanded normal force of the force-controlled arm in a case of
+    the uncertainty.
+
+    Args:
+        case: (18,) the case, in the order of `symbolic.contact.worst_cases.CASE_SIZES`.
+        leader: index of the other arm.
+    """
     return 1.0 - float(case[16 - leader])
 
 
@@ -168,7 +180,8 @@ USUAL_CONTROLLER: Control = "leader"
 def simulate_pads(
     cell: Cell, carry: Carry, settings: SimulationSettings, options: argparse.Namespace
 ) -> None:
-    """Find the threshold of a carry and its creep, simulate random cases, and print the results."""
+    """Simulate a carry with pads without arms and print the results: the least factor of the
+    planned forces that holds the box, its creep, and random cases of the uncertainty."""
     leader, workcell = options.leader - 1, cell.workcell
     moments = planned_moments(cell, carry) if settings.pads == "driven" else None
     witness = BoxSimulation(workcell, settings)
@@ -208,7 +221,8 @@ def simulate_pads(
 def simulate_hands(
     cell: Cell, carry: Carry, settings: SimulationSettings, options: argparse.Namespace
 ) -> None:
-    """Find the threshold of a carry in hands, simulate random cases, and print both."""
+    """Simulate a carry in hands without arms and print the results: the least factor of the planned
+    forces that holds the payload, and random cases of the uncertainty."""
     workcell = cell.workcell
     print(
         f"  without arms; the payload swings at {swing_frequency(workcell, settings):.1f} Hz on "
@@ -241,7 +255,8 @@ def simulate_hands(
 
 
 def _swept(step: float) -> tuple[float, float]:
-    """Return half and twice the time step [s], the latter at most `LARGEST_TIME_STEP`."""
+    """Return the time steps to compare with a time step [s]: half and twice as long, at most
+    `LARGEST_TIME_STEP`."""
     return step / 2.0, min(2.0 * step, LARGEST_TIME_STEP)
 
 
@@ -252,8 +267,12 @@ def _tell_sweep(step: float, threshold: Threshold[AnyOutcome]) -> None:
 def _tell_worst(
     pressed: Callable[[float], Outcome], planned: Callable[[], Outcome], workcell: Workcell
 ) -> None:
-    """Print how a box between pads with the least friction behaves, pressed with the least
-    commanded force and with its least forces."""
+    """Simulate a carry with the worst friction of the uncertainty and print whether the box holds.
+
+    Args:
+        pressed: simulation with the commanded forces; its argument is a factor of these.
+        planned: simulation with the planned forces.
+    """
     tracked = 1.0 - workcell.uncertainty.tracking
     outcome = pressed(tracked)
     print(
@@ -265,8 +284,12 @@ def _tell_worst(
 
 
 def threshold_text(threshold: Threshold[AnyOutcome], slip: float) -> str:
-    """Format a threshold in one line: the factors on both sides, and where and when the box
-    slips."""
+    """Format in one line the factors of the planned force just below and above the threshold, and
+    where and when the box slips.
+
+    Args:
+        slip: displacement that counts as slip [m].
+    """
     slips, holds = threshold.slips, threshold.holds
     return (
         f"  holds from {holds.factor:.4f} times the planned force on, slips at {slips.factor:.4f}: "
@@ -276,12 +299,14 @@ def threshold_text(threshold: Threshold[AnyOutcome], slip: float) -> str:
 
 
 def _moment(time: float) -> str:
-    """Format a time of a simulation; negative times are before the carry, while the pads press."""
+    """Format a time [s] from the beginning of the carry. Negative times, while the pads press
+    before it, are named as such."""
     return f"{-time:.3f} s before the carry" if time < 0.0 else f"at {time:.3f} s"
 
 
 def worst_friction(workcell: Workcell) -> Workcell:
-    """Return the workcell with the worst friction of its uncertainty, otherwise nominal."""
+    """Return the workcell with the least friction coefficients of its uncertainty, all else as
+    described."""
     case = nominal_case(workcell)
     case[0:2] *= 1.0 - workcell.uncertainty.friction
     return workcell_of_case(workcell, case)
@@ -327,7 +352,8 @@ def simulate_file(options: argparse.Namespace) -> int:
 
 
 def _controller(workcell: Workcell, options: argparse.Namespace) -> str:
-    """Return the controller to simulate, by default one that suits the cell.
+    """Return the name of the controller to simulate: the one in the options, or else one that suits
+    the cell.
 
     Raises:
         SimulationError: the requested controller does not suit the cell.
@@ -354,7 +380,7 @@ def _controller(workcell: Workcell, options: argparse.Namespace) -> str:
 
 
 def _timed(cell: Cell, x: Array, options: argparse.Namespace) -> Carry:
-    """Return the carry of an exported job with the timing of x."""
+    """Compute the carry of a decision vector x (n_var,) with the timing of an exported job."""
     model = cell.timing_model
     if options.planned_limit is not None:
         return exported_carry(cell, time_path(model, x, model.drive_limits(options.planned_limit)))

@@ -80,10 +80,10 @@ class StudySettings:
     Attributes:
         polish: settings of the polish; None for no polish.
         drivable: whether drivable carries are searched too.
-        drivable_replicas: number of replicas of this search per algorithm; None for the default of
-            `drivable_settings`.
+        drivable_replicas: number of replicas of the drivable search per algorithm; None for the
+            default of `drivable_settings`.
         drivable_polish: settings of the polish of drivable fronts; None for no polish.
-        wish: target of the recommendation.
+        wish: what the recommended carry should be best at.
         target: target of the export that the recommendation names; None for any simulator.
         simulate: whether the selected carries are simulated in the whole cell.
         report: whether figures, tables and the page are written.
@@ -108,8 +108,12 @@ class StudySettings:
 
 
 def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
-    """Return the stages of a study in order. There is no second experiment if the first is
-    drivable."""
+    """Return the stages of a study in order.
+
+    Args:
+        alone: True if the study's first experiment is drivable itself, so that there is no second
+            one.
+    """
     every = [search_stage()]
     if study.polish is not None:
         every.append(polish_stage(study.polish))
@@ -147,8 +151,8 @@ def report_stage(study: StudySettings) -> Stage:
 
 
 def _paths_beside(folder: CampaignFolder) -> Array:
-    """Return the paths that the first experiment of a study found, as starts for the drivable
-    experiment."""
+    """Return paths (m, n_path) that the first experiment of a study found, as starts for the
+    drivable experiment in the folder."""
     return known_paths(folder.root.parent, folder.workcell.task)
 
 
@@ -159,8 +163,10 @@ def run_study(
     progress: Progress,
     study: StudySettings,
 ) -> str:
-    """Run all stages that are not done, and return the figures as text. The cell is read again from
-    its file.
+    """Run all stages of a study that are not done yet. Return its figures as text.
+
+    Args:
+        workcell: the cell; it is read again from its file.
 
     Raises:
         DualArmError: the workcell, a setting or the results folder is invalid, or a stage failed.
@@ -201,6 +207,10 @@ def study_text(root: Path, with_paper: bool, brief: bool = False) -> str:
     """Format the figures of a finished study for a terminal, with the recommended carry first. With
     `brief`, only the recommended carry is shown, if there is one.
 
+    Args:
+        with_paper: True to show the paper's values beside those of the study.
+        brief: True to show only the recommended carry, if there is one.
+
     Raises:
         ResultsError: the folder is not complete or damaged.
     """
@@ -231,6 +241,10 @@ def study_text(root: Path, with_paper: bool, brief: bool = False) -> str:
 
 def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> None:
     """Make a study of a workcell file, print its figures, and show the requested views.
+
+    Args:
+        path: path of the workcell file.
+        with_paper: True to show the paper's values beside those of the study.
 
     Raises:
         DualArmError: the workcell, an option or the results folder is invalid, or a stage failed.
@@ -279,8 +293,12 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
 def campaign_settings(
     options: argparse.Namespace, objectives: tuple[str, ...] = PAPER_OBJECTIVES
 ) -> CampaignSettings:
-    """Return the campaign settings in the options, by default with the given objectives. If only a
-    recommendation is wanted, return those of the drivable experiment.
+    """Return the settings of a campaign in the options of a program; those of the drivable
+    experiment if only a recommendation is wanted.
+
+    Args:
+        options: options of the program.
+        objectives: objectives of the search unless the options name others.
 
     Raises:
         SettingsError: a value is not allowed.

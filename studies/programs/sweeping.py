@@ -73,7 +73,12 @@ def sweep_numbers(options: argparse.Namespace) -> int:
 
 
 def _of_file(cell: Cell, path: Path) -> Array:
-    """Return the decision vector of a stored carry, which has to fit this cell."""
+    """Return the decision vector (n_var,) of a stored carry.
+
+    Args:
+        cell: the cell, whose decision variables the carry has to fit.
+        path: path of the trajectory file.
+    """
     x = read_trajectory(path).x
     n_path = cell.workcell.task.n_path
     if x.shape == (n_path,):
@@ -84,7 +89,7 @@ def _of_file(cell: Cell, path: Path) -> Array:
 
 
 def _table(done: Sweep, longest: int = sys.maxsize) -> Table:
-    """Build the table of a sweep, with remarks cut to a maximal length."""
+    """Build the table of a sweep, with remarks cut to `longest` characters."""
     rows = [
         (
             *(f"{v:g}" for v in row.values),
@@ -99,8 +104,8 @@ def _table(done: Sweep, longest: int = sys.maxsize) -> Table:
 
 
 def _figure(done: Sweep) -> Figure:
-    """Draw duration and force over the values of the last key, one line per combination of the
-    others."""
+    """Draw duration and force of a sweep's carries over the values of the last key, one line per
+    combination of the other keys' values."""
     figure = new_figure(0.45)
     panels = figure.subplots(1, 2)
     *outer, last = done.over

@@ -117,8 +117,12 @@ def _replayed(
 
 
 def _driven(cell: Cell, x: Array) -> ProgramResult:
-    """Plan the job around a drivable carry x (n_var,) with the defaults of a study and an
-    export."""
+    """Plan the job around a drivable carry with the default settings of a study and an export, and
+    return its figures.
+
+    Args:
+        x: (n_var,) decision vector of the carry.
+    """
     try:
         job = job_model(cell.timing_model).plan(driven_timing(cell.timing_model, x))
     except DualArmError as error:
@@ -204,8 +208,12 @@ def _chosen(
 
 
 def _report(job: Job, stiffness: float | None) -> str:
-    """Return the text of a job's phases, of the effects of position control and of a late arm, and
-    of warnings."""
+    """Return a text on a job: its phases, the effects of position control and of one arm's delay,
+    and warnings.
+
+    Args:
+        stiffness: stiffness of each arm at its pad along the normal [N/m]; None if unknown.
+    """
     parts = [repr(job)]
     if job.follower is not None:
         parts += [
@@ -223,7 +231,8 @@ def _report(job: Job, stiffness: float | None) -> str:
 
 
 def check_file(options: argparse.Namespace) -> int:
-    """Check a joint trajectory in a cell, and print the result. Return the exit code."""
+    """Check whether a file of joint positions carries the box in a cell, and print the result.
+    Return the exit code."""
     workcell = load_workcell(options.workcell)
     cell = Cell(workcell, compiled=InterpretedCell(workcell))
     trajectory = joint_trajectory(options.trajectory, cell.workcell)
@@ -234,7 +243,8 @@ def check_file(options: argparse.Namespace) -> int:
 
 
 def robust_forces(options: argparse.Namespace) -> int:
-    """Print the robust forces of a trajectory file. Return the exit code."""
+    """Print the normal forces that a trajectory file needs in every case of the uncertainty. Return
+    the exit code."""
     stored = read_trajectory(options.file)
     with TemporaryDirectory() as folder:
         cell = stored.open_cell(Path(folder))
@@ -268,8 +278,8 @@ def _robust_forces(cell: Cell, x: Array, options: argparse.Namespace) -> int:
 
 
 def _priced(model: RobustModel, carry: Carry, options: argparse.Namespace) -> int:
-    """Print the price of an uncertainty that is not empty, and a check in random cases. Return the
-    exit code."""
+    """Print how much the normal forces of a carry grow with multiples of the uncertainty, and
+    whether they hold in random cases. Return the exit code."""
     price = robust_price(
         model,
         carry,
@@ -298,8 +308,14 @@ def _priced(model: RobustModel, carry: Carry, options: argparse.Namespace) -> in
 
 
 def _timed(cell: Cell, x: Array, limit: float) -> list[str]:
-    """Return lines on the fastest timing of a path within a force limit [N], applied to planned
-    forces and to robust forces."""
+    """Time a path as fast as possible within a force limit: once with planned forces, once with
+    those that hold in every case of the uncertainty. Return a line of text for each.
+
+    Args:
+        cell: the cell.
+        x: (n_var,) decision vector of the path.
+        limit: force limit [N].
+    """
     found = []
     for text, robust in (("planned forces", False), ("forces that hold in all cases", True)):
         timing = time_path(cell.timing_model, x, TimingLimits(force=limit, robust=robust))

@@ -61,8 +61,8 @@ class ReportRun:
     """One replica of one algorithm: its fronts and their indicators.
 
     Attributes:
-        front: the front of the search.
-        hybrid: the polished front, None without a polish.
+        front: front of the search, before a polish.
+        hybrid: polished front; None if it was not polished.
         figures: indicators of both fronts, as in summary.json.
     """
 
@@ -72,13 +72,13 @@ class ReportRun:
 
     @property
     def feasible(self) -> Array:
-        """(k, n_obj) objectives of the feasible candidates of the search."""
+        """(k, n_obj) objectives of all feasible candidates of the search."""
         found = self.front.evaluations
         return found.objectives[found.feasible]
 
     @property
     def fronts(self) -> tuple[Front, ...]:
-        """The front of the search and, if it is not empty, the polished front."""
+        """The front of the search; then the polished front, if there is one with points."""
         return (self.front, *([self.hybrid] if self.hybrid else []))
 
 
@@ -87,14 +87,14 @@ class AlgorithmRuns:
     """All replicas of one algorithm, and how it is drawn.
 
     Attributes:
-        name: as on the command line.
-        title: the name for people.
+        name: name on the command line.
+        title: name for people.
         look: line, colour and marker of the algorithm in all pictures.
         runs: the replicas.
-        representative: index in `runs` of the replica with the largest hypervolume, which pictures
-            of single runs show (the paper's 'best-performing run').
-        best: the trajectory selected from the representative replica's polished front, or else from
-            its front. None if that front is empty, and in a drivable experiment beside another one.
+        representative: index in `runs` of the replica with the largest hypervolume, the paper's
+            'best-performing run'. Pictures of single runs show it.
+        best: carry selected from that replica's polished front, or else from its front. None if the
+            front is empty, and in a second, drivable experiment.
     """
 
     name: str
@@ -120,8 +120,8 @@ class Experiment:
         objectives: names of the search's objectives.
         summary: the content of summary.json.
         algorithms: the algorithms in the order of the campaign.
-        union: in a drivable experiment the polished union of all fronts, else None, as without a
-            polish.
+        union: union of all fronts of a drivable experiment, polished as one front; None otherwise
+            or without a polish.
     """
 
     workcell: Workcell
@@ -133,8 +133,8 @@ class Experiment:
 
     @property
     def force_kind(self) -> ForceKind:
-        """Kind of normal forces, planned or robust, that force limits and drivable fronts refer
-        to."""
+        """Kind of the normal forces, planned or robust, that the force limits and objectives of the
+        experiment mean."""
         return force_kind(self.objectives)
 
     @property
@@ -148,9 +148,11 @@ class Experiment:
         return any(run.hybrid is not None for a in self.algorithms for run in a.runs)
 
     def fronts(self) -> Iterator[tuple[LineStyle, Front, bool]]:
-        """Yield the fronts of each algorithm's representative replica, then the polished union,
-        each as (look, front, replaced); replaced is True for a front of which a polished one
-        follows."""
+        """Yield the fronts of each algorithm's representative replica, then the polished union if
+        there is one.
+
+        Each comes with its line style, and with True if a polished front replaces it.
+        """
         for algorithm in self.solved:
             found = algorithm.shown.fronts
             after = found[-1] if self.union is None else self.union
@@ -174,17 +176,17 @@ class ReportData(Experiment):
         root: the results folder.
         geometry: the cell's collision bodies and pairs.
         objective_titles: names of the objectives for axes.
-        at_rest: (2,) the first two objectives of the level payload at rest; None if these are other
-            objectives than both robots' forces.
+        at_rest: (2,) first two objectives of the level payload at rest; None if the objectives are
+            not both robots' forces.
         initial: the hand-made trajectory.
-        timings: the label and the timings of each trajectory in `carries`.
-        reach: the regions that the arms reach, None in a report without the paper's pictures.
-        drivable: the drivable experiment, None without one.
-        recommended: (n_var,) decision vector of the carry to run, None without one.
-        jerk: table of what limits on jerk cost the selected carries and the recommended one, None
-            without such limits.
-        branches: how the start branches were chosen, None where the workcell file states them.
-        simulations: the carries that were driven in the simulated cell, empty without any.
+        timings: label and timings of each trajectory in `carries`.
+        reach: regions that the arms reach; None in a report without the paper's pictures.
+        drivable: the second, drivable experiment; None without one.
+        recommended: (n_var,) decision vector of the recommended carry; None without one.
+        jerk: table of how much longer carries last because of limits on jerk; None without such
+            limits.
+        branches: how the start branches were chosen; None if the workcell file states them.
+        simulations: results of the carries in the simulated cell.
         jobs: the whole jobs around the recommended and the hand-made trajectory.
     """
 
@@ -204,7 +206,7 @@ class ReportData(Experiment):
 
     @property
     def alone(self) -> bool:
-        """True if the first experiment is itself the drivable one."""
+        """True if the study has one experiment, which is drivable."""
         return is_drivable(self.workcell, self.objectives)
 
     @property
@@ -224,16 +226,15 @@ class ReportData(Experiment):
 
     @property
     def recommended_carry(self) -> DrawnCarry | None:
-        """The recommended carry as robots drive it, None if they cannot drive it or none is
-        recommended."""
+        """The recommended carry as robots drive it; None if they cannot or there is none."""
         job = self.job(RECOMMENDED_LABEL)
         carry = None if job is None or job.timing is None else job.timing.carry
         return None if carry is None else DrawnCarry(RECOMMENDED_LABEL, carry, RECOMMENDED_STYLE)
 
     @property
     def recommended_objectives(self) -> Array | None:
-        """(2,) the first two objectives of the recommended carry as robots drive it. None without a
-        recommendation, and where the objectives are neither both robots' forces nor duration and
+        """(2,) first two objectives of the recommended carry as robots drive it. None without a
+        recommendation, or if the objectives are neither both robots' forces nor duration and
         force."""
         found, reference = self.summary.recommendation, self.workcell.task.reference_force
         if found is not None and self.objectives[:2] == PAPER_OBJECTIVES:
@@ -328,8 +329,11 @@ def gather_carries(root: Path) -> tuple[CellGeometry, tuple[DrawnCarry, ...]]:
 
 
 def _experiment(results: CampaignResults, select: bool = True) -> Experiment:
-    """Read an experiment. With `select` a trajectory is selected from the representative replica of
-    each algorithm."""
+    """Read an experiment from its results folder.
+
+    Args:
+        select: True to select a trajectory from the representative replica of each algorithm.
+    """
     summary, fronts = read_summary(results.root), results.fronts
     union = next((front for front in fronts if front.algorithm == UNION), None)
     evaluator = results.cell.evaluator if select else None
@@ -361,8 +365,8 @@ def _hand_made(evaluator: CandidateEvaluator) -> DrawnCarry:
 
 
 def _titles(results: CampaignResults) -> tuple[str, ...]:
-    """Return the objectives' names for axes, in which the robots' names replace 'robot 1' and
-    'robot 2'."""
+    """Return the names of the objectives for axes, with the robots' own names in place of 'robot 1'
+    and 'robot 2'."""
     titles = [OBJECTIVES[name].title for name in results.objectives]
     for i, robot in enumerate(results.workcell.robots):
         titles = [title.replace(f"robot {i + 1}", robot.name) for title in titles]

@@ -67,8 +67,14 @@ RC: dict[Any, Any] = {
 
 @dataclass(frozen=True)
 class LineStyle:
-    """Colour, line, marker and hatch with which one trajectory or algorithm is drawn in all
-    pictures."""
+    """Style with which one trajectory or algorithm is drawn in all pictures.
+
+    Attributes:
+        colour: colour of lines and markers, as '#rrggbb'.
+        line: Matplotlib's line style.
+        marker: Matplotlib's marker.
+        hatch: Matplotlib's hatch.
+    """
 
     colour: str
     line: Any
@@ -84,7 +90,7 @@ class LineStyle:
         """Return Matplotlib's keyword arguments for markers without a line.
 
         Args:
-            size: of the markers [points].
+            size: size of the markers [points].
             edge: colour of the markers' edges.
             opened: True for markers without filling, with edges in the colour of the style.
         """
@@ -147,7 +153,8 @@ def in_style() -> Iterator[None]:
 
 
 def settled(figure: Figure) -> Figure:
-    """Compute the layout of a figure and fix it, so that all files of the figure look the same."""
+    """Compute and fix the layout of a figure, so that all its files look the same. Return the
+    figure."""
     with in_style():
         engine = figure.get_layout_engine()
         assert engine is not None
@@ -160,15 +167,24 @@ def settled(figure: Figure) -> Figure:
 
 
 def legend_below(figure: Figure, axes: Axes, columns: int = 0) -> None:
-    """Draw the legend of one panel below the whole figure, in one row unless the number of columns
-    is given."""
+    """Draw the legend of one panel below the whole figure.
+
+    Args:
+        axes: the panel.
+        columns: number of columns; 0 for one row.
+    """
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=columns or len(handles))
 
 
 def limit_line(axes: Axes, level: float, label: str, across: bool = True) -> None:
-    """Draw a limit as a dashed line: horizontal at y = `level`, or vertical at x = `level` if not
-    `across`."""
+    """Draw a limit as a dashed line through a panel.
+
+    Args:
+        level: value of the limit on the axis that the line crosses.
+        label: name in the legend.
+        across: True for a horizontal line at y = `level`, False for a vertical one at x = `level`.
+    """
     draw = axes.axhline if across else axes.axvline
     draw(level, color="black", linestyle="--", linewidth=0.9, label=label)
 
@@ -218,13 +234,13 @@ LIGHT = np.array([-0.45, 0.35, 0.82]) / np.linalg.norm([-0.45, 0.35, 0.82])
 
 @dataclass(frozen=True)
 class DrawnCarry:
-    """One judged trajectory and how pictures draw it.
+    """An evaluated carry, and how pictures draw it.
 
     Attributes:
         label: name in legends.
-        timed: the trajectory under the timing that pictures show.
+        timed: the carry with the timing that pictures show.
         look: style of its lines.
-        source: the search that found it, with its replica where there are several.
+        source: search that found the carry, with its replica if there are several.
     """
 
     label: str
@@ -239,7 +255,7 @@ class DrawnCarry:
 
     @cached_property
     def sensitivity(self) -> PayloadSensitivity:
-        """Contact forces of the unchanged motion against the payload's mass."""
+        """Contact forces of the same motion for other masses of the payload."""
         # Not imported at the top: pictures of a cell need no timing.
         from hybrid_opt.timing.robustness import payload_sensitivity
 
@@ -248,12 +264,12 @@ class DrawnCarry:
 
 @dataclass(frozen=True)
 class View:
-    """A direction of parallel projection, as from an infinitely far camera.
+    """A direction of parallel projection from the world to a picture.
 
     Attributes:
         right, up: (3,) unit vectors in the world frame that point to the right and up in the
             picture.
-        x_label, y_label: titles of the picture's axes; '' where they are not axes of the world.
+        x_label, y_label: titles of the picture's axes; '' if they are no axes of the world.
         mirrored: True if the world coordinate on the horizontal axis increases to the left.
     """
 
@@ -283,8 +299,12 @@ SIDE = View(_X, _Z, "x [m]", "z [m]")
 
 
 def oblique(azimuth: float, elevation: float) -> View:
-    """Return the view of a viewer in the given direction from the scene: azimuth about z from +x,
-    and elevation above the horizontal [rad]."""
+    """Return the view from a direction in the world.
+
+    Args:
+        azimuth: angle about z from +x to the horizontal direction towards the viewer [rad].
+        elevation: angle of the direction towards the viewer above the horizontal [rad].
+    """
     right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
     towards = np.array(
         [
@@ -302,8 +322,16 @@ ISOMETRIC = oblique(np.deg2rad(-152.0), np.deg2rad(26.0))
 
 @dataclass(frozen=True)
 class Faces:
-    """Triangles of one solid, cut to at most `MAX_EDGE`: vertices (k, 3, 3) [m] and normals (k, 3)
-    in the solid's frame, and their colour."""
+    """Triangles of one solid. Except those of ground, they are small enough to be sorted by depth.
+
+    Attributes:
+        frame: frame of the solid.
+        triangles: (k, 3, 3) corners in this frame [m]; edges are at most `MAX_EDGE` long unless the
+            solid is ground.
+        normals: (k, 3) unit normals in this frame.
+        colour: red, green and blue in [0, 1].
+        is_ground: True for ground.
+    """
 
     frame: Frame
     triangles: Array
@@ -314,7 +342,7 @@ class Faces:
 
 @dataclass(frozen=True)
 class CutCell:
-    """The geometry of a cell, with the cut triangles of the solids that are drawn."""
+    """The geometry of a cell, and its drawn solids as small triangles."""
 
     geometry: CellGeometry
     faces: tuple[Faces, ...]
@@ -323,8 +351,12 @@ class CutCell:
     def of(
         cls, geometry: CellGeometry, solids: Sequence[Solid], marked: Collection[str] = ()
     ) -> CutCell:
-        """Cut solids of the cell into triangles with edges of at most `MAX_EDGE`. The colour of a
-        solid depends on its group; those with a name in `marked` are red."""
+        """Cut solids of a cell into small triangles. The colour of a solid depends on its group.
+
+        Args:
+            solids: the solids to draw.
+            marked: names of solids that are drawn in red.
+        """
         corners = [solid.vertices[solid.faces] for solid in solids]
         numbers = np.repeat(np.arange(len(solids)), [len(each) for each in corners])
         limits = np.array([np.inf if solid.is_ground else MAX_EDGE for solid in solids])
@@ -346,12 +378,12 @@ def _cut(corners: Array, of: NDArray[np.intp], limits: Array) -> tuple[Array, ND
     solid. Triangles with a common edge are cut at the same place.
 
     Args:
-        corners: (n, 3, 3) vertices [m].
+        corners: (n, 3, 3) corners of the triangles [m].
         of: (n,) index of each triangle's solid.
-        limits: longest edge per solid [m].
+        limits: longest allowed edge for each solid [m].
 
     Returns:
-        Vertices (k, 3, 3) of the small triangles, and (k,) indices of their solids.
+        Corners (k, 3, 3) of the small triangles, and (k,) index of each one's solid.
     """
     while True:
         lengths = np.linalg.norm(np.roll(corners, -1, axis=1) - corners, axis=2)
@@ -381,11 +413,11 @@ def draw_cell(
     q: Array,
     hidden: tuple[str, ...] = (),
 ) -> None:
-    """Draw the cell at one sample.
+    """Draw the cell at one sample of a motion.
 
     Args:
         pose: (6,) pose of the box [m, rad].
-        q: (12,) joint positions of both arms [rad].
+        q: (joints,) joint positions of both arms side by side [rad or m].
         hidden: kinds of frames whose solids are left out.
     """
     placed = frame_placements(cell.geometry, pose[None], q[None])
@@ -427,8 +459,8 @@ def draw_cell(
 
 
 def _polygons(flat: Array, **style: Any) -> PolyCollection:
-    """Return a Matplotlib collection of polygons (n, k, 2). It exists because Matplotlib's type
-    stubs do not know that one array is accepted, which is faster."""
+    """Return a Matplotlib collection of polygons flat (n, k, 2). One array is faster than a list,
+    but unknown to Matplotlib's type stubs."""
     return PolyCollection(flat, **style)  # type: ignore[arg-type]
 
 
@@ -439,8 +471,11 @@ def draw_path(axes: Axes, view: View, points: Array, **style: object) -> None:
 
 
 def draw_box_edges(axes: Axes, view: View, lower: Array, upper: Array, **style: object) -> None:
-    """Draw the twelve edges of the axis-aligned box between two opposite corners (3,) in the
-    world."""
+    """Draw the twelve edges of a box along the world's axes.
+
+    Args:
+        lower, upper: (3,) corners with the least and largest coordinates [m].
+    """
     flat = view.flat(box_corners(lower, upper))
     # Corners whose numbers differ in one bit are neighbours.
     edges = [flat[[i, i | bit]] for i in range(8) for bit in (1, 2, 4) if not i & bit]
@@ -452,8 +487,13 @@ MARGIN = 0.06
 
 
 def frame_axes(axes: Axes, view: View, points: Array, margin: float = MARGIN) -> None:
-    """Set the limits of a picture to contain points (n, 3) of the world, with equal scales and a
-    margin [m]. The axes get titles if the view has any, else they are hidden."""
+    """Set the limits of a picture such that it contains given points, with equal scales. Axes
+    without titles in the view are hidden.
+
+    Args:
+        points: (n, 3) points in the world [m].
+        margin: distance of the points from the border [m].
+    """
     flat = view.flat(points)
     lower, upper = flat.min(axis=0) - margin, flat.max(axis=0) + margin
     axes.set_xlim(lower[0], upper[0])
@@ -474,12 +514,12 @@ def _negated(value: float, _: object) -> str:
 
 
 def aspect(view: View, points: Array) -> float:
-    """Return the width of points (n, 3) of the world over their height, both in the picture of a
-    view."""
+    """Return the width over the height of points (n, 3) of the world as seen in a view."""
     width, height = np.ptp(view.flat(points), axis=0)
     return float(width / height)
 
 
 def box_corners(lower: Array, upper: Array) -> Array:
-    """Return the 8 corners (8, 3) of the axis-aligned box between two opposite corners (3,)."""
+    """Return the 8 corners (8, 3) of a box along the axes, from its least and its largest corner
+    (3,)."""
     return np.array(list(product(*zip(lower, upper, strict=True))))

@@ -53,7 +53,7 @@ class ReportPicture:
     """One picture of the report.
 
     Attributes:
-        name: of its files, without suffix.
+        name: name of the picture's files, without suffix.
         caption: one or two sentences of plain text.
         make: function that draws the figure; it sets no style.
     """
@@ -69,15 +69,21 @@ class ReportPicture:
 
 
 def _of(name: str, draw: Callable[..., Figure], *given: Any, caption: str = "") -> ReportPicture:
-    """Return the picture that `draw` makes of the arguments in `given`. Without a caption, the
-    docstring of `draw` without the word 'Draw' becomes the caption."""
+    """Return a picture that a function draws from given arguments.
+
+    Args:
+        name: name of the picture's files, without suffix.
+        draw: function that draws the figure.
+        caption: caption of the picture; '' for the docstring of `draw` without the word 'Draw'.
+        given: arguments of `draw`.
+    """
     text = " ".join((caption or inspect.getdoc(draw) or "").removeprefix("Draw ").split())
     return ReportPicture(name, text[:1].upper() + text[1:], partial(draw, *given))
 
 
 def report_pictures(data: ReportData) -> Iterator[ReportPicture]:
-    """Yield all pictures that the data suffices for: those of the recommended carry, then the
-    paper's in the order of the paper."""
+    """Yield all pictures for which a report has data: those of the recommended carry, then those of
+    the paper in its order."""
     yield from _first_pictures(data)
     if data.reach is not None:
         yield from _paper_pictures(data, data.reach)
@@ -234,8 +240,13 @@ def _listed(data: ReportData) -> list[ReportPicture]:
 
 
 def _drawn(data: bytes, pdf: bool, index: int) -> dict[str, bytes]:
-    """Draw the picture with this index of a report, whose data is pickled. Return the contents of
-    the files by suffix."""
+    """Draw one picture of a report. Return the contents of its files by suffix.
+
+    Args:
+        data: data of the report, pickled.
+        pdf: True for a PDF beside the PNG.
+        index: index of the picture among those of `report_pictures`.
+    """
     return files_of(_unpickled(data)[index].draw(), pdf)
 
 
@@ -303,8 +314,12 @@ def _paper_text(data: ReportData) -> str:
 
 
 def _block(text: str, attributes: str = "") -> str:
-    """Return a script element that holds a compressed text, which `boot.js` of the page unpacks.
-    Equal texts give equal elements."""
+    """Return an HTML script element with a compressed text, which `boot.js` of the page unpacks.
+    Equal texts give equal elements.
+
+    Args:
+        attributes: further attributes of the element.
+    """
     content = base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
     return f"<script type='application/gzip'{attributes}>{content}</script>"
 
@@ -359,8 +374,7 @@ def _facts(data: ReportData) -> str:
 
 
 def _assumed(data: ReportData) -> str:
-    """Return one or two sentences that say which kind of contact the forces of each experiment
-    assume."""
+    """Return a sentence or two on the kind of contact that the forces of each experiment assume."""
     said = f"The forces of this experiment are of {contact_model(data.workcell).assumption}."
     if data.drivable is None:
         return said

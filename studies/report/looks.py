@@ -48,7 +48,7 @@ GIF_COLOURS = 128
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """A motion of the cell to be animated.
+    """A motion of box and arms, to be animated.
 
     Attributes:
         label: text above the picture.
@@ -74,9 +74,10 @@ class Film:
 
 
 def follow_looks(root: Path, options: argparse.Namespace) -> None:
-    """Show a study in the ways that the command line requests: write an animation of the first
-    selected trajectory, or of the hand-made one if none was selected; and serve until Ctrl-C the
-    report, or a page that plays the last selected trajectory if there is no report.
+    """Show a study as the command line requests: write an animation, and serve a page until Ctrl-C.
+
+    The animation shows the first selected trajectory, or else the hand-made one. The page is the
+    report, or without a report a page that plays the last selected trajectory.
 
     Args:
         root: the results folder.
@@ -100,10 +101,15 @@ def follow_looks(root: Path, options: argparse.Namespace) -> None:
 
 
 def write_animation(geometry: CellGeometry, film: Film, path: Path) -> None:
-    """Write an animation in real time to `path`; the suffix, .gif or .mp4, decides the format.
+    """Write an animation in real time to a file.
+
+    Args:
+        geometry: geometry of the cell.
+        film: the motion.
+        path: path of the file; its suffix, .gif or .mp4, decides the format.
 
     Raises:
-        ReportError: the suffix is another, or the MP4 writer is not installed.
+        ReportError: the suffix is neither, or the MP4 writer is not installed.
     """
     suffix = path.suffix.lower()
     if suffix not in (".gif", ".mp4"):
@@ -191,8 +197,11 @@ def page_of(root: Path) -> bytes:
 
 
 def page_server(page: bytes, port: int) -> ThreadingHTTPServer:
-    """Return a server that answers browsers of this machine with a page, at the given port or at
-    any free one if it is in use.
+    """Return a server that answers browsers of this machine with one page.
+
+    Args:
+        page: the page.
+        port: port of the server; if it is in use, a free one is taken.
 
     Raises:
         ReportError: no port is free.

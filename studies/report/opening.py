@@ -11,8 +11,8 @@ from studies.study.recommendation import StoredRecommendation
 
 
 def answer_html(data: ReportData) -> str:
-    """Return the recommendation, or the reason why there is none, as HTML; '' for a study without
-    both."""
+    """Return the recommendation of a study, or the reason why there is none, as HTML; '' if the
+    study has neither."""
     found = data.summary.answer("")
     if found is None:
         return ""
@@ -39,8 +39,8 @@ def _tile(fact: Fact, choice: StoredRecommendation | None) -> str:
 
 
 def _bar(choice: StoredRecommendation) -> str:
-    """Return HTML of a bar that shows the commanded force, divided into its contributions, beside
-    the allowed force."""
+    """Return a bar as HTML that shows the commanded force and its contributions, beside the allowed
+    force."""
     allowed = choice.force if choice.allowed is None else float(choice.allowed[1 - LEADER])
     whole = max(allowed, choice.force)
     parts = "".join(

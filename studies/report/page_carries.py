@@ -51,16 +51,16 @@ HELD = ("lift", "carry", "set_down")
 
 @dataclass(frozen=True)
 class DrawnJob:
-    """The job around a trajectory for a report, or the reason why there is none.
+    """The job around a trajectory, or the reason why there is none.
 
     Attributes:
         label: name of the trajectory.
-        problem: why no job can be planned, '' if one is.
+        problem: reason why no job can be planned, else ''.
         job: the planned job, None if there is none.
-        remark: how the commanded forces were chosen, and which limits the timing ignores.
+        remark: how the commanded forces were chosen, and which limits the timing does not keep.
         timing: timing of the trajectory, None if that failed.
-        margins: largest errors of the cell's description that the commanded forces tolerate; only
-            of the recommended carry.
+        margins: largest errors of the cell's description that the commanded forces tolerate, for
+            the recommended carry only.
     """
 
     label: str
@@ -76,7 +76,7 @@ def recommended_job(x: Array, cells: Sequence[ReadyCell]) -> DrawnJob:
 
     Args:
         x: (n_var,) decision vector of the carry.
-        cells: cells of the report; the carry belongs to the last one.
+        cells: cells of the report; the last one is the cell in which the carry was found.
     """
     model = cells[-1].jobs
     found = drawn(model, RECOMMENDED_LABEL, lambda: driven_timing(model.timing, x), True)
@@ -86,14 +86,15 @@ def recommended_job(x: Array, cells: Sequence[ReadyCell]) -> DrawnJob:
 
 
 def drawn_job(label: str, x: Array, limits: TimingLimits, cells: Sequence[ReadyCell]) -> DrawnJob:
-    """Plan the job around a path of the first cell, driven in the last cell, with the default
-    forces of an export and within the cell's limits on jerk, which is slow.
+    """Plan the job around a path, with the default forces of an export and within the cell's limits
+    on jerk. This is slow.
 
     Args:
         label: name of the trajectory.
-        x: (n_var,) decision vector in the first cell's task.
-        limits: further limits of the timing.
-        cells: cells of the report.
+        x: (n_var,) decision vector of the path in the first cell.
+        limits: limits of the timing in addition to those of the cell.
+        cells: cells of the report; the path belongs to the first one, and robots drive in the last
+            one.
     """
     model = cells[-1].jobs
     (path,) = resample_decisions(x, cells[0].cell.workcell.task, model.workcell.task)
@@ -103,14 +104,14 @@ def drawn_job(label: str, x: Array, limits: TimingLimits, cells: Sequence[ReadyC
 def drawn(
     model: JobModel, label: str, timed: Callable[[], Timing], within_jerk: bool = False
 ) -> DrawnJob:
-    """Time a trajectory and plan the job around it. If either fails with a DualArmError, the result
-    holds the message.
+    """Time a trajectory and plan the job around it. If either fails, the result holds the message
+    of the error.
 
     Args:
-        model: plans jobs in the cell.
+        model: planner of jobs in the cell.
         label: name of the trajectory.
-        timed: computes the timing.
-        within_jerk: whether the carry keeps the cell's limits on jerk.
+        timed: function that computes the timing.
+        within_jerk: True if the carry keeps the cell's limits on jerk.
     """
     timing = None
     try:
@@ -124,12 +125,15 @@ def drawn(
 
 
 def job_samples(job: Job) -> Array:
-    """Return samples (k, 11 + joints) of a job: some evenly spread in each phase, and those with
-    the largest forces.
+    """Return samples of a job for the page: some evenly spread in each phase, and those with the
+    largest forces.
 
-    The columns are time [s], pose of the box (6) [m, rad], all joint positions [rad], both
-    commanded normal forces [N], and the two least forces of `needed_forces` [N], which are NaN in
-    phases in which the box stands.
+    The columns are: time [s]; pose of the box (6) [m, rad]; joint positions of both arms [rad or
+    m]; commanded normal force of each arm [N]; least normal force in every case of the uncertainty,
+    and in the nominal case [N], as from `needed_forces`. The last two are NaN while the box stands.
+
+    Returns:
+        (k, 11 + joints) samples.
     """
     parts = []
     for phase in job.phases:
@@ -147,24 +151,40 @@ def job_samples(job: Job) -> Array:
 
 
 def needed_forces(workcell: Workcell, motion: BoxMotion) -> Array:
-    """Return the least normal forces (n, 2) of the force-controlled arm that hold the box during a
-    motion [N]: in every case of the uncertainty (column 0), and in the nominal case (column 1)."""
+    """Compute the least normal force of the force-controlled arm that holds the box during a
+    motion.
+
+    Args:
+        workcell: the cell, with its uncertainty.
+        motion: motion of the box at n samples.
+
+    Returns:
+        (n, 2) force that is enough in every case of the uncertainty, and in the nominal case [N].
+    """
     model = robust_model(workcell)
     every = model.commanded(motion, workcell.uncertainty, LEADER)
     return np.column_stack([every, model.nominal(motion, LEADER)[:, 1 - LEADER]])
 
 
 def _rows(time: Array, count: int, peaks: Iterable[int]) -> NDArray[np.intp]:
-    """Return sorted indices of samples: at most `count` evenly spread in time, the samples in
-    `peaks`, the first and the last."""
+    """Choose samples for the page: some evenly spread in time, given ones, the first and the last.
+
+    Args:
+        time: (n,) ascending times [s].
+        count: largest number of evenly spread samples.
+        peaks: indices of samples to include.
+
+    Returns:
+        Indices in ascending order, without repetition.
+    """
     moments = np.linspace(time[0], time[-1], min(len(time), count))
     even = np.searchsorted(time, moments).clip(max=len(time) - 1)
     return np.unique([0, *even, *peaks, len(time) - 1])
 
 
 def _once(table: Array) -> Array:
-    """Remove rows of a table (n, k) whose time, in column 0, equals that of the row before. They
-    occur where two phases meet and where an acceleration jumps."""
+    """Remove rows of a table (n, k) whose time, in the first column, equals that of the row before.
+    They occur where phases meet or an acceleration jumps."""
     return np.asarray(table[np.concatenate([[True], np.diff(table[:, 0]) > 1e-9])])
 
 
@@ -179,8 +199,11 @@ PHASE_LIMITS = (
 
 
 def phases(jobs: Sequence[DrawnJob], robots: Sequence[str]) -> Table:
-    """Return the table of the phases of whole jobs: times, largest forces and uses of the limits.
-    `robots` are the names of both robots."""
+    """Return the table of the phases of jobs: times, largest forces, and used shares of the limits.
+
+    Args:
+        robots: names of both robots.
+    """
     rows: list[tuple[str, ...]] = []
 
     def add(
@@ -235,14 +258,15 @@ NO_JOB = "shown of the recommended and the hand-made carry only; an export plans
 
 @dataclass(frozen=True)
 class PageTrajectory:
-    """One trajectory to be shown on the page.
+    """One trajectory that the page shows.
 
     Attributes:
-        source: the search that found it, as text, stored in a file saved from the page.
+        source: text on the search that found the trajectory; it is stored in a file that is saved
+            from the page.
         x: (n_var,) decision vector.
-        cell: index of its cell among the cells of the page.
+        cell: index of the trajectory's cell among those of the page.
         recommended: whether it is the recommended carry.
-        job: the whole job around it, None where none is shown.
+        job: the job around the trajectory; None if none is shown.
     """
 
     source: str
@@ -253,8 +277,13 @@ class PageTrajectory:
 
 
 def _with_job(trajectory: dict[str, Any], found: DrawnJob) -> None:
-    """Add a planned job as one more motion to the JSON values of a trajectory, or the reason why
-    there is none."""
+    """Add a job to the JSON values of a trajectory as a further motion; or the reason why there is
+    none.
+
+    Args:
+        trajectory: the values, which are changed.
+        found: the job, or the reason.
+    """
     job, motions = found.job, trajectory["motions"]
     if job is None:
         trajectory["jobProblem"] = found.problem
@@ -367,6 +396,10 @@ def _timed(cell: ho.Cell, driving: ReadyCell, shown: PageTrajectory) -> tuple[Ti
         cell: the cell of the trajectory.
         driving: the cell that robots drive.
         shown: the trajectory.
+
+    Returns:
+        The timing and ''; or the failed timing, None without any, and the reason why robots cannot
+        drive the trajectory.
     """
     task = driving.cell.workcell.task
     try:
@@ -399,28 +432,41 @@ def _motion(name: str, carry: ho.Carry, commanded: Array | None = None) -> dict[
 def _uses(
     workcell: Workcell, whole: Array, contact: Sequence[Array]
 ) -> dict[str, list[float | None]]:
-    """Return the largest use of each joint's torque [%] under two keys, for all loads and for the
-    contact wrenches alone; None for joints without a torque limit.
+    """Return the largest use of each joint's torque limit [%]: `torqueUse` for all loads,
+    `contactTorqueUse` for the contact wrenches alone. None for joints without a limit.
 
     Args:
         whole: (n, joints) torques of all loads [N m].
-        contact: arrays (n, joints) of torques of the contact wrenches [N m].
+        contact: arrays (n, joints) of torques of the contact wrenches, one per phase [N m].
     """
     torques = {"torqueUse": whole, "contactTorqueUse": np.concatenate(contact)}
     return {name: _rounded(joint_torque_use(workcell, each), 3) for name, each in torques.items()}
 
 
 def joint_torque_use(workcell: Workcell, torque: Array) -> Array:
-    """Return the largest use of each joint's torque limit, (joints,) [%], for torques (n, joints)
-    [N m]; NaN for joints without a limit."""
+    """Compute the largest use of each joint's torque limit.
+
+    Args:
+        workcell: the cell.
+        torque: (n, joints) joint torques of both arms side by side [N m].
+
+    Returns:
+        (joints,) uses [%]; NaN for joints without a limit.
+    """
     limit = workcell.stack_joint_limits("torque_max")
     use = 100.0 * np.abs(torque).max(axis=0) / limit
     return np.where(np.isfinite(limit), use, np.nan)
 
 
 def _values(cell: ho.Cell, judged: ho.Carry, found: dict[str, Any]) -> str:
-    """Return the values in a trajectory's title: duration and commanded force if there is one; else
-    planned forces, or the objectives."""
+    """Return the text in the title of a trajectory: duration and commanded force; without a
+    commanded force planned forces, or else the objectives.
+
+    Args:
+        cell: the cell of the trajectory.
+        judged: the evaluated carry.
+        found: JSON values of the trajectory.
+    """
     if found["commanded"] is not None:
         order = contact_model(cell.workcell).order
         return f"{found['duration']:.2f} s, {order} {found['commanded']:.1f} N"
@@ -438,8 +484,16 @@ def _values(cell: ho.Cell, judged: ho.Carry, found: dict[str, Any]) -> str:
 
 
 def _samples(carry: ho.Carry, commanded: Array | None) -> Array:
-    """Return samples (k, 11 + joints) of a carry with the columns of `job_samples`. Without
-    commanded forces (n, 2) [N] the planned ones are used, and the needed forces are NaN."""
+    """Return samples of a carry for the page, with the columns of `job_samples`.
+
+    Args:
+        carry: the carry at n samples.
+        commanded: (n, 2) commanded normal force of each arm [N]; None for the planned ones, with
+            NaN in the last two columns.
+
+    Returns:
+        (k, 11 + joints) samples.
+    """
     force = carry.normal_force if commanded is None else commanded
     peaks = np.concatenate([force.argmax(axis=0), force.argmin(axis=0)])
     time = carry.time - carry.time[0]

@@ -65,20 +65,25 @@ def plain(text: str) -> str:
 
 
 def marker(look: LineStyle, opened: bool = False, size: float = 9) -> Plot:
-    """Return plotly's marker in a line style; with `opened` it has no filling, as searched fronts
-    beside polished ones."""
+    """Return plotly's marker in a line style.
+
+    Args:
+        look: the line style.
+        opened: True for a marker without filling, as for searched fronts beside polished ones.
+        size: size of the marker [pixels].
+    """
     symbol = SYMBOLS[look.marker]
     return {"color": look.colour, "symbol": f"{symbol}-open" if opened else symbol, "size": size}
 
 
 def points(label: str, at: Array, members: Sequence[int], texts: Sequence[str], look: Plot) -> Plot:
-    """Return a plotly trace of points that show their trajectories when clicked.
+    """Return a plotly trace of points, each of which shows its trajectory when it is clicked.
 
     Args:
         label: name in the legend.
         at: (k, 2) coordinates.
-        members: indices of the trajectories on the page.
-        texts: what is shown when the pointer is over a point.
+        members: index of each point's trajectory on the page.
+        texts: text of each point that is shown while the pointer is over it.
         look: plotly's marker.
     """
     at = np.asarray(at, dtype=float).reshape(-1, 2)
@@ -94,8 +99,13 @@ def points(label: str, at: Array, members: Sequence[int], texts: Sequence[str], 
 
 
 def cloud(label: str, at: Array, look: LineStyle) -> Plot:
-    """Return a plotly trace of feasible candidates (n, 2) for the background, of which at most
-    `CLOUD_PER_ALGORITHM` are kept."""
+    """Return a plotly trace of feasible candidates for the background of a plot.
+
+    Args:
+        label: name of the algorithm.
+        at: (n, 2) coordinates, of which at most `CLOUD_PER_ALGORITHM` are kept.
+        look: line style of the algorithm.
+    """
     at = at[evenly(len(at), CLOUD_PER_ALGORITHM)]
     flat = [{"dtype": "f4", "bdata": packed(column, np.float32)} for column in at.T]
     style = {"color": look.colour, "symbol": SYMBOLS[look.marker], "size": 3, "opacity": 0.4}
@@ -125,9 +135,9 @@ def front_plot(name: str, titles: tuple[str, str], traces: list[Plot], first: Ar
 
     Args:
         name: text on the button that shows the plot.
-        titles: of both axes.
+        titles: titles of both axes.
         traces: the plot's traces, from back to front.
-        first: (k, 2) points that the plot shows at first.
+        first: (k, 2) points that are visible at first.
     """
     chosen = {"color": "rgba(0,0,0,0)", "size": 20, "line": {"color": MARKED, "width": 2.5}}
     whole = [np.column_stack([t["x"], t["y"]]) for t in traces if isinstance(t["x"], list)]
@@ -155,8 +165,12 @@ def _legend(edge: str, place: float, size: int) -> Plot:
 
 
 def limits(points: Array, share: float = LOOK_MARGIN) -> list[list[float]]:
-    """Return the limits of both axes that contain points (k, 2), with a margin of `share` times
-    their range."""
+    """Return least and largest value of both axes such that points are visible.
+
+    Args:
+        points: (k, 2) the points.
+        share: margin on each side, over the range of the points.
+    """
     points = _finite(points)
     if len(points) == 0:
         return [[0.0, 1.0], [0.0, 1.0]]
@@ -172,14 +186,16 @@ def _finite(points: Array) -> Array:
 
 
 def drive_look(points: Array, always: Array, allowed: float) -> Array:
-    """Return those points (k, 2) of force [N] and duration [s] that the plot of time against force
-    shows at first. Left out are the long flat ends of a front, which would squash the part between
-    them.
+    """Select the points of duration and force that a plot shows at first. The long flat ends of
+    fronts are left out, because they would squash the part between them.
 
     Args:
-        points: (n, 2) points of the fronts and curves.
+        points: (n, 2) force [N] and duration [s] of fronts and curves.
         always: (m, 2) points that must be shown.
-        allowed: the reference force [N].
+        allowed: reference force [N].
+
+    Returns:
+        (k, 2) selected points.
     """
     points = _finite(points)
     if len(points) == 0:
@@ -191,9 +207,10 @@ def drive_look(points: Array, always: Array, allowed: float) -> Array:
 
 def carry_plots(workcell: Workcell) -> dict[str, Plot]:
     """Return the plotly plots of one trajectory by the ids of their HTML elements, without data.
-    The entry `meta` of a trace tells the page's script which data to insert: a column of the
-    samples, a constant level, or one arm's joints from a list; and the trace's name where forces
-    are planned ones."""
+
+    The entry `meta` of a trace says which data the page's script inserts: a column of the samples,
+    a constant, or the joints of one arm. It also has the name of the trace for planned forces.
+    """
     joints, arm = [len(robot.torque_max) for robot in workcell.robots], 1 - LEADER
     force, robot = 7 + sum(joints), plain(workcell.robots[arm].name)
     curve = {"type": "scatter", "mode": "lines"}
@@ -268,16 +285,16 @@ cannot be saved from the page."""
 
 @dataclass(frozen=True)
 class MeshGroup:
-    """Trajectories that share a list on the page and a trace in a plot.
+    """Trajectories that share one list on the page and one trace in a plot.
 
     Attributes:
         listed: name of the list.
         shown: the trajectories.
         label: name of the trace.
         look: plotly's marker of the trace, None for trajectories that are only listed.
-        points: (k, 2) coordinates in the plot; None for the commanded force and the duration as
-            robots drive the trajectories.
-        joined: whether a line joins the points.
+        points: (k, 2) coordinates in the plot; None for commanded force and duration as robots
+            drive the trajectories.
+        joined: True if a line joins the points.
     """
 
     listed: str
@@ -300,7 +317,7 @@ def page_document(
     Args:
         data: what the report shows.
         workers: processes that compute trajectories, None for this process.
-        paper: whether the first experiment's selected carries and fronts are included.
+        paper: True to include the selected carries and the fronts of the first experiment.
     """
     # Where the cell itself is drivable there is one experiment.
     cells = [] if data.alone else [(data.files, data.objectives)]
@@ -344,8 +361,12 @@ def _trajectory(cells: Cells, shown: PageTrajectory) -> dict[str, Any]:
 
 
 def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator[MeshGroup]:
-    """Yield the groups of trajectories that robots drive: the recommended carry, the hand-made path
-    at some force limits, and the final fronts. `cell` is the index of their cell on the page."""
+    """Yield the groups of trajectories as robots drive them: the recommended carry, the hand-made
+    path at some force limits, and the final fronts.
+
+    Args:
+        cell: index of the trajectories' cell on the page.
+    """
     if data.recommended is not None:
         found = data.summary.recommendation
         source = "" if found is None else found.source
@@ -373,8 +394,12 @@ def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator
 
 
 def _search_groups(data: ReportData, paper: bool) -> Iterator[MeshGroup]:
-    """Yield the groups of trajectories of the first experiment: the hand-made and the selected
-    ones, and the fronts; if not `paper`, the hand-made one alone."""
+    """Yield the groups of trajectories of the first experiment: the hand-made one, the selected
+    ones, and the fronts.
+
+    Args:
+        paper: False to yield the hand-made trajectory alone.
+    """
     picked = [PageTrajectory(c.source, c.x, job=data.job(c.label)) for c in data.carries]
     if not paper:
         yield MeshGroup("Hand-made", tuple(picked[:1]))
@@ -389,8 +414,12 @@ def _search_groups(data: ReportData, paper: bool) -> Iterator[MeshGroup]:
 
 
 def _traces(groups: Sequence[Numbered], found: Sequence[dict[str, Any]]) -> Iterator[Plot]:
-    """Yield the plotly traces of groups that have a marker; `found` are all trajectories of the
-    page as JSON values."""
+    """Yield a plotly trace for each group that has a marker.
+
+    Args:
+        groups: groups of trajectories with their numbers on the page.
+        found: JSON values of all trajectories of the page.
+    """
     for group, members in groups:
         if group.look is None:
             continue
@@ -417,8 +446,8 @@ def _drive_view(
     groups: Sequence[Numbered],
     found: Sequence[dict[str, Any]],
 ) -> Plot:
-    """Return the plot of duration against commanded force, as jobs drive the carries: the hand-made
-    path, the fronts, the recommended carry and the allowed force."""
+    """Return the plotly plot of duration against commanded force as robots drive the carries:
+    hand-made path, fronts, recommended carry and allowed force."""
     allowed = float(drivable.workcell.task.reference_force[1 - LEADER])
     # The recommended carry is drawn last, above all others.
     shown = sorted(_traces(groups, found), key=lambda trace: trace["name"] == RECOMMENDED_TITLE)
@@ -438,8 +467,8 @@ def _drive_view(
 
 
 def _allowed(force: float) -> Plot:
-    """Return a vertical line with text at the reference force [N], as entries of a plotly
-    layout."""
+    """Return entries of a plotly layout for a vertical line with text at the reference force
+    [N]."""
     look = {"color": "#8a6d00", "dash": "dash", "width": 1.6}
     line = {"type": "line", "x0": force, "x1": force, "yref": "paper", "y0": 0, "y1": 1}
     text = {"x": force, "yref": "paper", "y": 1, "text": f"allowed {force:.1f} N"}

@@ -39,9 +39,9 @@ def _per_robot(
     """Return a figure with one panel per robot, common axes and one legend.
 
     Args:
-        titles: of both axes.
-        draw: draws into the panel of a robot, of index 0 or 1.
-        columns: of the legend, 0 for one row.
+        titles: titles of both axes.
+        draw: function that draws into the panel of the robot with index 0 or 1.
+        columns: number of columns of the legend; 0 for one row.
     """
     figure = new_figure(0.48)
     panels = figure.subplots(1, 2, sharey=True)
@@ -181,12 +181,12 @@ def joint_torques(data: ReportData) -> Figure:
 
 
 def _label_rings(axes: Axes, most: Array, top: float) -> None:
-    """Set rings of a polar plot at round values up to `top` [%]. Their labels stand in the gap
-    between two neighbouring joints that leave most room.
+    """Label the rings of a polar plot at round values. The labels stand between two neighbouring
+    joints where there is most room.
 
     Args:
         most: (n,) largest use of each joint's torque [%].
-        top: radius of the plot [%].
+        top: largest value of the plot [%].
     """
     rings = MaxNLocator(6, steps=[1, 2, 5, 10]).tick_values(0.0, 1.02 * top)
     axes.set_ylim(0.0, rings[-1])

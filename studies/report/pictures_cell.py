@@ -66,16 +66,17 @@ REACH_POSTURES = 300_000
 
 @dataclass(frozen=True)
 class ReachMap:
-    """Positions that the pads and the box can take, on a grid of cubes; orientations are ignored.
+    """Positions that the pads and the box centre can take, on a grid of cubes. Orientations are
+    ignored.
 
-    A cube counts as reached if a random posture within the joint limits puts the pad into it.
+    A pad reaches a cube if it is in the cube in some random posture within the joint limits.
 
     Attributes:
         lower: (3,) lower corner of the grid in the world frame [m].
         step: edge of the cubes [m].
-        pads: per arm a boolean array (nx, ny, nz), True for reached cubes.
-        common: boolean array (nx, ny, nz), True for positions of the box centre from which a level
-            box has both pads in cubes that their arms reach.
+        pads: for each arm a boolean array (nx, ny, nz), True for cubes that the pad reaches.
+        common: boolean array (nx, ny, nz), True for cubes of the box centre in which both pads of a
+            level box are in cubes that they reach.
     """
 
     lower: Array
@@ -85,8 +86,8 @@ class ReachMap:
 
 
 def reach_map(geometry: CellGeometry, rng: np.random.Generator) -> ReachMap:
-    """Return the cubes that both pads reach in random postures within the joint limits. Holes of a
-    few cubes, which random postures miss, are filled."""
+    """Compute the cubes that each pad reaches in random postures within the joint limits. Holes of
+    a few cubes, which random postures miss, are filled."""
     clouds = [_pad_points(geometry, i, rng) for i in (0, 1)]
     both = np.concatenate(clouds)
     lower = np.floor(both.min(axis=0) / CUBE_EDGE - 3.0) * CUBE_EDGE
@@ -107,8 +108,14 @@ def reach_map(geometry: CellGeometry, rng: np.random.Generator) -> ReachMap:
 
 
 def _pad_points(geometry: CellGeometry, i: int, rng: np.random.Generator) -> NDArray[np.float32]:
-    """Return pad positions (REACH_POSTURES, 3) of arm i in the world frame [m], in random postures
-    within the joint limits."""
+    """Compute positions of an arm's pad in random postures within the joint limits.
+
+    Args:
+        i: index of the arm.
+
+    Returns:
+        (REACH_POSTURES, 3) positions in the world [m].
+    """
     arm, contact = geometry.arms[i], geometry.workcell.contacts[i]
     pad = (arm.T_joint_box @ contact.T_box_pad)[:3, 3]
     # Single precision is far more than cubes need, and half the work.
@@ -211,7 +218,7 @@ def _draw_views(
         pose: (6,) pose of the box [m, rad].
         q: (12,) joint positions of both arms [rad].
         hidden: kinds of frames whose solids are left out.
-        margin: around the points [m].
+        margin: distance of the points from the border of a picture [m].
     """
     for axes, letter, (text, view, points) in zip(panels, "abc", shown, strict=True):
         draw_cell(axes, cell, view, pose, q, hidden)
@@ -220,8 +227,12 @@ def _draw_views(
 
 
 def facing(way: Array) -> View:
-    """Return an oblique view in which a motion along the direction (3,) comes towards the viewer,
-    so that the machine does not hide its arm."""
+    """Return an oblique view in which a motion comes towards the viewer, so that a machine does not
+    hide its arm.
+
+    Args:
+        way: (3,) direction of the motion in the world.
+    """
     return max(ISOMETRIC, OTHER_SIDE, key=lambda view: float(way @ view.towards))
 
 
@@ -295,8 +306,14 @@ def paths(geometry: CellGeometry, carries: tuple[DrawnCarry, ...]) -> Figure:
 
 
 def planes(points: Array) -> tuple[tuple[View, str], tuple[View, str]]:
-    """Return the two coordinate planes in which points (n, 3) extend farthest, each as a view and
-    its name."""
+    """Return the two planes of world axes in which points extend farthest.
+
+    Args:
+        points: (n, 3) points in the world [m].
+
+    Returns:
+        For each plane a view onto it, and its name.
+    """
     extent = np.ptp(points, axis=0)
     every = (("y–z plane", FRONT_VIEW, 0), ("x–z plane", SIDE, 1), ("x–y plane", _PLAN, 2))
     first, second, _ = sorted(every, key=lambda plane: float(extent[plane[2]]))
@@ -330,9 +347,13 @@ def _reach_bounds(reach: ReachMap) -> Array:
 
 
 def _draw_reach(axes: Axes, reach: ReachMap, view: View, across: int, at: float) -> None:
-    """Draw slices of the reached regions across a world axis, at coordinate `at` [m]. Across the
-    line between the arms, only the common region is drawn, because the pads' regions would hide
-    it."""
+    """Draw a slice through the regions that the pads and the box centre reach. In slices across y
+    only the common region is drawn, because the pads' regions would hide it.
+
+    Args:
+        across: index of the world axis that is perpendicular to the slice.
+        at: coordinate of the slice on this axis [m].
+    """
     index = int((at - reach.lower[across]) / reach.step)
     if across == 0:
         for pads, colour, hatch in zip(reach.pads, ARM_COLOURS, HATCHES, strict=True):
@@ -351,8 +372,14 @@ def _draw_slice(
     hatch: str,
     alpha: float = 0.35,
 ) -> None:
-    """Fill one slice of a region (nx, ny, nz) of the grid. `across` is the world axis that is
-    perpendicular to the slice, `index` the slice's position in cubes."""
+    """Fill one slice of a region.
+
+    Args:
+        reach: the grid.
+        across: index of the world axis that is perpendicular to the slice.
+        index: index of the slice's cubes along this axis.
+        region: boolean array (nx, ny, nz), True in the region.
+    """
     mask = np.take(region, index, axis=across)
     if not mask.any():
         return
@@ -392,7 +419,7 @@ def meeting(
         pair: names of the bodies.
         pose: (6,) pose of the box at the collision [m, rad].
         q: (joints,) joint positions of both arms at the collision [rad].
-        title: of the figure.
+        title: title of the figure.
     """
     figure = new_figure(0.36)
     solids = cell_solids(geometry)
@@ -416,13 +443,15 @@ def meeting_place(
     pose: Array,
     q: Array,
 ) -> Array:
-    """Return the middle (3,) of the intersection of two bodies' bounding boxes in the world frame
-    [m].
+    """Compute the middle of the region in which the bounding boxes of two bodies intersect.
 
     Args:
         pair: names of the bodies.
         pose: (6,) pose of the box [m, rad].
         q: (joints,) joint positions of both arms [rad].
+
+    Returns:
+        (3,) position in the world [m].
     """
     placed = frame_placements(geometry, pose[None], q[None])
     low, high = np.full(3, -np.inf), np.full(3, np.inf)

@@ -98,7 +98,12 @@ def attainment(data: ReportData) -> Figure:
 
 def _attained(title: str, percentile: float) -> str:
     """Return the legend entry of an attainment surface. Both quartiles look alike, so only one of
-    them gets an entry."""
+    them gets an entry.
+
+    Args:
+        title: name of the algorithm.
+        percentile: percentile of the replicas that the surface belongs to.
+    """
     if percentile not in QUARTILES:
         return f"{title}: median"
     shares = " and ".join(f"{share:.0f} %" for share in QUARTILES)
@@ -145,7 +150,7 @@ def _paired(axes: Axes, algorithms: Sequence[AlgorithmRuns]) -> None:
 
 
 def _objectives(axes: Axes, data: ReportData) -> None:
-    """Set the axes to the first two objectives; draw the level payload at rest and the star of the
+    """Prepare axes for the first two objectives, with the level payload at rest and the star of the
     recommended carry."""
     if data.at_rest is not None:
         look: dict[str, Any] = {
@@ -170,8 +175,12 @@ def _recommended(axes: Axes, data: ReportData) -> None:
 
 
 def _zoom(axes: Axes, data: ReportData, sets: Sequence[Array]) -> None:
-    """Set the limits of the axes to contain the fronts, the level payload at rest and the
-    recommended carry."""
+    """Set the limits of axes such that fronts, the level payload at rest and the recommended carry
+    are visible.
+
+    Args:
+        sets: objectives (k, n_obj) of each front.
+    """
     points = [np.atleast_2d(points)[:, :2] for points in sets if len(points)]
     if data.at_rest is not None:
         points.append(data.at_rest[None])
