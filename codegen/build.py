@@ -87,7 +87,8 @@ class CSource:
         """Generate the C text of a CasADi function.
 
         If the function has no form in lanes, a warning is given and the text has one lane. For
-        `level` None the size of the generated text decides the optimisation level.
+        `level` None the size of the generated text decides the optimisation level. The function is
+        called `name` in its set.
         """
         from codegen.source import c_source, dense, generated_c, operations
 

@@ -57,7 +57,7 @@ _KEY_END = re.compile("[-.]")
 
 
 def key_of(what: str, **parts: object) -> str:
-    """Return the key of a cache entry: a digest of the kind `what` and of all ingredients.
+    """Return the key of a cache entry: a digest of its kind and of all its ingredients.
 
     Every key of a cache is computed here. The ingredients of each kind are:
 
@@ -68,6 +68,10 @@ def key_of(what: str, **parts: object) -> str:
                      (`hybrid_opt.compiled_cell`)
       code           sources of packages, without comments (`Cache.code_digest`)
       compiler       processor; the entry names the compiler (`codegen.build.compiler_of`)
+
+    Args:
+        what: the kind.
+        parts: the ingredients by name.
     """
     named = [f"{name}={value}" for name, value in sorted(parts.items())]
     return digest(what, str(CACHE_FORMAT), *named)
@@ -247,7 +251,7 @@ class Cache:
         return facts
 
     def write_record(self, key: str, facts: Mapping[str, Any]) -> None:
-        """Store a record with its checksum, in one step."""
+        """Store a record under a key, with its checksum, in one step."""
         text = json.dumps({"facts": facts, "sha256": digest(_canonical(facts))}, indent=1)
         self._make_folder()
         with _writing(self.folder):

@@ -54,6 +54,11 @@ class CompiledFunction(NumericFunction):
     def __init__(self, signature: Signature, library: Path, loaded: ctypes.CDLL) -> None:
         """Wrap the function in a loaded library.
 
+        Args:
+            signature: names and shapes of inputs and outputs.
+            library: path of the shared library.
+            loaded: ctypes handle of the library.
+
         Raises:
             CodegenError: the library has no driver.
         """

@@ -105,7 +105,7 @@ _INTERRUPTED = threading.Event()
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """On Ctrl-C in the `with` block, end all compilers of this process and start no new ones.
+    """End all compilers of this process on Ctrl-C in the `with` block, and start no new ones.
 
     Compilation starts again when the main thread asks for the next function.
     """
@@ -283,15 +283,23 @@ class Compiler:
 
 
 def default_level(c_bytes: int) -> int:
-    """Return the optimisation level for a source of this size [bytes] that keeps the build
-    short."""
+    """Return the optimisation level, 0 to 3, that keeps the compile time of a C text short.
+
+    Args:
+        c_bytes: size of the text [bytes].
+    """
     if c_bytes <= SMALL_SOURCE:
         return 3
     return 1 if c_bytes <= LARGE_SOURCE else 0
 
 
 def part_level(c_bytes: int, in_lanes: bool) -> int:
-    """Return the optimisation level of a function that is compiled separately (`codegen.parts`)."""
+    """Return the optimisation level of a function that is compiled separately (`codegen.parts`).
+
+    Args:
+        c_bytes: size of the function's C text [bytes].
+        in_lanes: whether the function is written for lanes.
+    """
     level = LANE_LEVEL if in_lanes else default_level(c_bytes)
     return level if c_bytes < LONG_PART else min(level, 1 if in_lanes else 2)
 

@@ -215,14 +215,14 @@ class NumericFunction(ABC):
     def prepared(
         self, n: int, shared: Collection[str] = (), given: Mapping[str, Array] | None = None
     ) -> PreparedBatch:
-        """Prepare a batch of up to n evaluations on arrays with fixed addresses, which can be
-        evaluated repeatedly.
+        """Prepare a batch of up to n evaluations on fixed arrays, which can be evaluated
+        repeatedly.
 
         This pays if one evaluation takes little time compared with the checks and allocations of
         `batch`.
 
         Args:
-            n: at least 1.
+            n: largest number of evaluations, at least 1.
             shared: names of inputs with one value for all evaluations.
             given: the caller's own arrays for some inputs and outputs, (n, *shape), C-contiguous.
 
@@ -259,9 +259,11 @@ class NumericFunction(ABC):
     def _prepared(
         self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
     ) -> tuple[Callable[[int], None], Callable[[], NativeCall] | None]:
-        """Return a function that evaluates the first `count` items of a batch on fixed arrays, and
-        a function that returns their addresses for C; None in place of the latter if C cannot
-        evaluate it."""
+        """Return a function that evaluates the first items of a batch, given their number.
+
+        The second result is a function that returns addresses for C; None if C cannot evaluate the
+        batch.
+        """
 
         def run(count: int) -> None:
             self._evaluate_batch(inputs, batched, outputs, count, 1)
@@ -349,7 +351,14 @@ class PreparedBatch:
         run: Callable[[int], None],
         native: Callable[[], NativeCall] | None = None,
     ) -> None:
-        """Store the arrays and the function that evaluates them."""
+        """Store the arrays and the function that evaluates them.
+
+        Args:
+            inputs, outputs: arrays by name.
+            size: largest number of evaluations.
+            run: function that evaluates the first items, given their number.
+            native: function that returns addresses for C; None if C cannot evaluate the function.
+        """
         self.inputs, self.outputs, self.size, self._run = inputs, outputs, size, run
         self._native = native
 
@@ -382,11 +391,15 @@ def ports(
     batched: Sequence[bool],
     outputs: Sequence[Array],
 ) -> ctypes.Array[ctypes.c_longlong]:
-    """Return the address and step [numbers] of every argument and result of a batch, as drivers in
-    C take them (`codegen/c/driver.c`).
+    """Return the addresses of the arguments and results of a batch, as drivers in C take them.
+
+    For each array this is its address and the step from one evaluation to the next, in numbers
+    (`codegen/c/driver.c`).
 
     Args:
-        batched: which inputs have one value for each evaluation.
+        signature: signature of the function.
+        inputs, outputs: the arrays.
+        batched: for each input, True if it has one value per evaluation.
     """
     steps = [
         prod(shape) if per_candidate else 0

@@ -175,8 +175,10 @@ def _lines(function: re.Match[str], shared: Collection[int] = ()) -> str:
 
 
 def _choice(function: re.Match[str]) -> str | None:
-    """Translate `casadi.Function.if_else`; None for another function. Each branch runs if a lane
-    needs it, and a mask selects its lanes."""
+    """Translate the C of `casadi.Function.if_else` to lanes; None for another function.
+
+    Each branch runs if a lane needs it, and a mask selects the lanes that keep its results.
+    """
     branches = _CHOICE.match(function["body"])
     if branches is None or function["outputs"] is None:
         return None

@@ -151,7 +151,7 @@ def _preamble(*runtimes: str) -> str:
 
 
 def is_long(body: str) -> bool:
-    """Return True if a function is so long that it is cut."""
+    """Return True if a function is so long that it is cut into pieces."""
     return body.count("\n") >= CUT_STATEMENTS
 
 
@@ -191,8 +191,9 @@ def _cut(found: re.Match[str]) -> str:
 
 
 def _used(piece: list[str]) -> tuple[set[str], set[str]]:
-    """Return the variables that a piece reads before it sets them, and the variables that it
-    sets."""
+    """Return the variables that C lines read before they set them, and the variables that
+    they set.
+    """
     read, written = set[str](), set[str]()
     for line in piece:
         variables = _VARIABLE.findall(line)

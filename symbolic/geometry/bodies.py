@@ -30,11 +30,11 @@ about 15 s."""
 
 @dataclass(frozen=True)
 class Frame:
-    """Frame to which a body is fixed.
+    """A frame to which bodies are fixed.
 
     Attributes:
-        kind: 'world', 'box', or 'link' for the frame behind a joint of a robot.
-        robot, joint: indices of the robot and the joint of a link, from 0; otherwise -1.
+        kind: 'world', 'box', or 'link' for the frame that a joint of a robot moves.
+        robot, joint: for a link the indices of the robot and of the joint, from 0; otherwise -1.
     """
 
     kind: Literal["world", "link", "box"]
@@ -73,12 +73,12 @@ class CollisionBody(ContentRecord):
 
 @dataclass(frozen=True)
 class ArmGeometry(ContentRecord):
-    """The constant geometry of an arm's joints.
+    """The constant geometry of an arm's n joints.
 
     Attributes:
         T_world_root: (4, 4) root of the URDF in the world.
-        origins: (n, 4, 4) frame of each joint in the frame of the joint before it (of the first
-            joint in the root), at joint position zero.
+        origins: (n, 4, 4) frame of each joint at position zero, in the frame of the joint before
+            it; of the first joint in the root.
         axes: (n, 3) unit axis of each joint in the joint's frame.
         turning: (n,) True for joints that turn about their axis, False for joints that slide along
             it.
@@ -122,6 +122,7 @@ def collision_bodies(
     environment.
 
     Args:
+        workcell: the workcell.
         meshes: reader of the meshes; None for a new one.
 
     Raises:
@@ -160,7 +161,7 @@ def _check_body(seen: CacheKey) -> None:
 
 
 def arm_geometry(workcell: Workcell, i: int) -> ArmGeometry:
-    """Compute the geometry of robot i's joints as numbers."""
+    """Compute frames, axes and limits of the joints of robot i (0 or 1)."""
     robot, contact = workcell.robots[i], workcell.contacts[i]
     model = arm_model(robot)
     data = model.createData()

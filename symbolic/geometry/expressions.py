@@ -44,16 +44,16 @@ class Softness:
     turn: float | None = None
 
     def absolute_above(self, x: ca.SX) -> ca.SX:
-        """Compute |x| or slightly more."""
+        """Compute abs(x), or up to `width` more."""
         return ca.sqrt(x * x + self.width**2) if self.width else ca.fabs(x)
 
     def entry_above(self, x: ca.SX) -> ca.SX:
-        """Compute |x| of an entry of a rotation, or slightly more."""
+        """Compute abs(x) of an entry x of a rotation, or up to `turn` more."""
         turn = self.width if self.turn is None else self.turn
         return ca.sqrt(x * x + turn**2) if turn else ca.fabs(x)
 
     def absolute_below(self, x: ca.SX) -> ca.SX:
-        """Compute |x| or slightly less."""
+        """Compute abs(x), or up to `width` less."""
         return self.absolute_above(x) - self.width
 
     def ramp_above(self, x: ca.SX) -> ca.SX:

@@ -65,10 +65,10 @@ def chain_joints(urdf: Urdf, root: str, tip: str) -> tuple[str, ...]:
 
 
 def held_joints(urdf: Urdf, moving: Sequence[str], locked: Positions) -> Positions:
-    """Return every joint of a description that is held, with its position.
+    """Return every joint of a description that is held, with its position [rad or m].
 
-    The position is the one in `locked`, else zero or the limit closest to zero. A joint that mimics
-    a held joint has the position that follows.
+    The position is the one in `locked`, else zero or the limit closest to zero. The position of a
+    joint that mimics a held joint follows from that joint.
 
     Args:
         urdf: the description.
@@ -248,11 +248,11 @@ def _reduced(kinematics: str, file: str, held: Positions) -> pin.Model:
 
 
 def moving_joints(urdf: Urdf, chain_root: str, flange: str, locked: Positions) -> tuple[str, ...]:
-    """Return the joints that move an arm's flange.
+    """Return the names of the joints that move an arm's flange.
 
     Args:
         urdf: the robot's description.
-        chain_root: link at which the chain begins; '' for all joints that are not locked.
+        chain_root: link at which the chain of joints begins; '' for all joints that are not locked.
         flange: link at which the chain ends.
         locked: joints that the user holds, with their positions [rad or m].
     """
@@ -359,10 +359,11 @@ thirteen arms of 0.74 to 1.75 m are below it, 6 % for a GoFa 12."""
 
 
 def usual_manipulability(model: pin.Model, flange: str) -> float:
-    """Compute the default of `min_manipulability` [m^3], to two digits.
+    """Compute the default of `min_manipulability` for an arm, to two digits [m^3].
 
-    The default scales with the cube of the arm's length, as |det J| does. The length covers the
-    last seven joints. Joints that move the whole arm, such as a lift, are not part of it.
+    The default scales with the cube of the arm's length, as the manipulability does. The length
+    covers the last seven joints. Joints that move the whole arm, such as a lift, are not part of
+    it.
     """
     length = float(link_lengths(model, flange)[-FOLLOWING - 1 :].sum())
     return float(f"{MANIPULABILITY_SHARE * length**3:.1e}")

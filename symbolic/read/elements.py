@@ -48,6 +48,10 @@ class _LimitedBuilder(ElementTree.TreeBuilder):
 def parse_elements(document: str, root_tag: str = "robot") -> ElementTree.Element:
     """Parse an XML document and return its root element.
 
+    Args:
+        document: the text.
+        root_tag: tag that the root element has to have.
+
     Raises:
         OutsideError: the document is not XML, has too many elements, or a root with another tag.
     """

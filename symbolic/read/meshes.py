@@ -41,7 +41,11 @@ trimesh.util.log.setLevel(logging.CRITICAL)
 
 
 def read_mesh(path: Path, scale: Array) -> trimesh.Trimesh:
-    """Read a mesh, scaled by (3,) factors, with equal vertices merged.
+    """Read a triangle mesh, scale it, and merge equal vertices.
+
+    Args:
+        path: the file.
+        scale: (3,) scale factors along x, y and z.
 
     Raises:
         CollisionModelError: the file cannot be read, or is empty, flat, too large or too fine.

@@ -179,17 +179,22 @@ class SceneBuilder:
             self.plane(name, pose @ transform(axes_with_z(normal / length), foot))
 
     def plane(self, name: str, pose: Array) -> None:
-        """Add the half-space below the x-y plane of a frame with the pose (4, 4) in the world."""
+        """Add the half-space below the x-y plane of a frame.
+
+        Args:
+            name: name of the plane in the scene.
+            pose: (4, 4) of the frame in the world.
+        """
         size = " x ".join(f"{side:g}" for side in SLAB)
         self.note(name, f"is a plane; a slab of {size} m below it takes its place")
         self.add(name, *slab_below(pose))
 
     def leave(self, name: str, why: str) -> None:
-        """Report that a part is left out."""
+        """Report that a part of the scene is left out, with the reason `why`."""
         self.left_out.append(f"{safe_io.printable(name) or 'scene'}: {why}")
 
     def note(self, name: str, what: str) -> None:
-        """Report that a part is represented differently than in the scene."""
+        """Report how a body differs from the scene."""
         self.notes.append(f"{safe_io.printable(name) or 'scene'}: {what}")
 
     def _name(self, name: str) -> str:

@@ -37,8 +37,10 @@ SDF_SHAPES = {"box": Box, "sphere": Sphere, "cylinder": Cylinder, "capsule": Cap
 
 
 def read_scene(path: Path) -> ImportedScene:
-    """Read the obstacles of an SDF file (a world or a model), of an MJCF file, or of a MoveIt
-    planning scene (the message in YAML, or the text format .scene).
+    """Read the obstacles of a scene file.
+
+    This is an SDF file (a world or a model), an MJCF file, or a MoveIt planning scene (the message
+    in YAML, or the text format .scene).
 
     Raises:
         SceneError: the file cannot be read, is no scene, or is wrong. The message lists every
@@ -399,11 +401,7 @@ _PLACES = {"primitives": "primitive_poses", "meshes": "mesh_poses", "planes": "p
 def _frame(table: TableReader, place: str = "position", turn: str = "orientation") -> Array:
     """Read a pose (4, 4) from a position and a quaternion; a missing one is zero.
 
-    Each is a table with the keys x, y, z (and w), or an array.
-
-    Args:
-        table: the table.
-        place, turn: keys of the position and of the quaternion.
+    Each is a table with the keys x, y, z (and w), or an array, at the keys `place` and `turn`.
     """
     parts = []
     for key, letters in ((place, "xyz"), (turn, "xyzw")):
@@ -507,8 +505,8 @@ def _written_object(name: str, words: Sequence[str], placed: bool, found: SceneB
     Args:
         name: name of the object.
         words: the words after the name.
-        placed: True in a new file, which states a pose of the object; False in an old file, whose
-            shapes are relative to the world.
+        placed: True if the file states a pose of the object; False for an old file, whose shapes
+            are relative to the world.
         found: collector of bodies.
     """
     at = 0

@@ -171,7 +171,7 @@ class TableReader:
         return checked_vector(value, allowed, self.at(key), self.problems, filling)
 
     def integer(self, key: str, low: int, high: int, default: int) -> int:
-        """Read an integer within [low, high]."""
+        """Read an integer from `low` to `high`; `default` if the key is missing."""
         found: int = self.value(key, Annotated[int, Range(low, high)], default)
         return found
 
@@ -486,7 +486,12 @@ def _xyz_rpy(table: TableReader) -> Array:
 
 
 def read_body(table: TableReader, folder: Path) -> Body:
-    """Read a named collision shape with its pose; mesh paths are relative to `folder`."""
+    """Read a named collision shape with its pose.
+
+    Args:
+        table: table of the body.
+        folder: folder to which the path of a mesh is relative.
+    """
     name, pose = table.text("name"), _xyz_rpy(table)
     kind = table.choice("kind", tuple(SHAPES))
     if not kind:  # without a kind no key is known

@@ -125,6 +125,10 @@ def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
     difference between samples, and `lost`; pose (6 + m,), the extended pose of the sample; wrench
     (6,) on the box about the nominal contact point, world axes [N, N m]. Outputs: next_state, then
     `TRACK_OUTPUTS`.
+
+    Args:
+        robot, model, contact: the arm, its model, and its contact with the box.
+        name: name of the new function.
     """
     n = model.n_joints
     state, pose = ca.MX.sym("state", 3 * n + 1), ca.MX.sym("pose", model.pose_size)
@@ -167,6 +171,10 @@ def torque_function(robot: Robot, model: RobotModel, contact: Contact, name: str
 
     Inputs: joints (n,) [rad or m], extended pose (6 + m,), and wrench (6,) on the box about the
     nominal contact point, world axes [N, N m].
+
+    Args:
+        robot, model, contact: the arm, its model, and its contact with the box.
+        name: name of the new function.
     """
     q, pose = ca.SX.sym("q", model.n_joints), ca.SX.sym("pose", model.pose_size)
     wrench = ca.SX.sym("wrench", 6)
@@ -257,8 +265,13 @@ def follow_function(
     poses; wrench (6, samples) on the box about the nominal contact point [N, N m]. Outputs:
     `TRACK_OUTPUTS` of all samples, one column per sample.
 
-    The second sample has no earlier motion to extrapolate, so Newton steps from the start posture
-    predict its joints.
+    The second sample has no earlier motion to extrapolate, so Newton steps from the start
+    posture predict its joints.
+
+    Args:
+        robot, model, contact: the arm, its model, and its contact with the box.
+        samples: number of samples.
+        name: name of the new function.
     """
     start, pose = ca.MX.sym("start", model.n_joints), ca.MX.sym("pose", model.pose_size, samples)
     wrench, given = ca.MX.sym("wrench", 6, samples), mx_parameters(robot)
@@ -288,6 +301,10 @@ def start_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
     extended pose. The redundant joints move evenly from their start positions to their values in
     the extended pose, in `BEGIN_STEPS` Newton steps that keep the flange at the box. Output: state
     (3 n + 1,) without motion.
+
+    Args:
+        robot, model, contact: the arm, its model, and its contact with the box.
+        name: name of the new function.
     """
     n = model.n_joints
     start, pose = ca.MX.sym("start", n), ca.MX.sym("pose", model.pose_size)
@@ -317,6 +334,10 @@ def prediction_function(
     Inputs: state (3 n + 1,) of `track_function` after the first sample; pose (6 + m,), the extended
     pose of the second sample. Output: the state with the joints' first difference that Newton steps
     find.
+
+    Args:
+        robot, model, contact: the arm, its model, and its contact with the box.
+        name: name of the new function.
     """
     n = model.n_joints
     state, pose = ca.SX.sym("state", 3 * n + 1), ca.SX.sym("pose", model.pose_size)

@@ -164,9 +164,13 @@ def interpreted_approach(model: RobotModel) -> Approach:
 def approach_function(model: RobotModel, name: str) -> ca.Function:
     """Build the function of damped Newton steps towards a placement of the flange.
 
-    Inputs: q (n,) [rad, or m for a sliding joint]; wanted rotation (3, 3) and position (3,) of the
-    flange in the root. Outputs: reached (n,), joints before the last step; residual, the pose
+    Inputs: q (n,) [rad, or m for a sliding joint]; wanted rotation (3, 3) and position (3,) [m] of
+    the flange in the root. Outputs: reached (n,), joints before the last step; residual, the pose
     residual of these joints [m, rad]; next (n,), joints after the last step.
+
+    Args:
+        model: model of the arm.
+        name: name of the new function.
     """
     q, R, p = ca.SX.sym("q", model.n_joints), ca.SX.sym("R", 3, 3), ca.SX.sym("p", 3)
     rotation, position, jacobian = model.kinematics(q)
