@@ -60,7 +60,14 @@ class DaskWorkers(Workers):
     def _results(
         self, function: Callable[[Argument], Result], arguments: Sequence[Argument]
     ) -> Iterator[tuple[int, Result]]:
-        """Yield the index and the result of each call, in the order in which the calls end.
+        """Call a function once per argument on the cluster.
+
+        Args:
+            function: function of one argument.
+            arguments: one argument for each call.
+
+        Yields:
+            Index and result of each call, in the order in which the calls end.
 
         Raises:
             SettingsError: Dask is not installed, or no scheduler or worker answers.

@@ -91,7 +91,7 @@ class CompiledCell:
 
     @classmethod
     def of(cls, cell: Workcell | CompiledCell) -> CompiledCell:
-        """Return the compiled functions of a workcell; a `CompiledCell` is returned unchanged."""
+        """Return compiled functions of a cell; a `CompiledCell` is returned unchanged."""
         return cell if isinstance(cell, CompiledCell) else cls(cell)
 
     @cached_property

@@ -288,13 +288,16 @@ def selected_row(evaluator: CandidateEvaluator, x: Array) -> int:
 
 
 def peak_normal_forces(evaluator: CandidateEvaluator, x: Array) -> Array:
-    """Compute the peak normal force (n, 2) of each robot [N] for decision vectors (n, n_var)."""
+    """Compute the peak normal force (n, 2) of each robot [N] along the carries of decision vectors
+    (n, n_var).
+    """
     return _peaks_and_durations(evaluator, x)[0]
 
 
 def _peaks_and_durations(evaluator: CandidateEvaluator, x: Array) -> tuple[Array, Array]:
-    """Compute peak normal forces (n, 2) [N] and durations (n,) [s] of decision vectors (n,
-    n_var)."""
+    """Compute peak normal forces (n, 2) of both robots [N] and durations (n,) [s] of the carries of
+    decision vectors (n, n_var).
+    """
     peaks, durations = [], []
     for begin in range(0, len(x), _CHUNK):
         outputs = evaluator.outputs(x[begin : begin + _CHUNK])

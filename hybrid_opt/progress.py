@@ -159,6 +159,6 @@ class Progress:
             yield advance
 
     def note(self, text: str) -> None:
-        """Print a separate line."""
+        """Print a text on a line of its own, without disturbing the line of progress."""
         if self.shown:
             tqdm.write(text, file=sys.stderr)

@@ -238,7 +238,7 @@ def _ends(workcell: Workcell, outputs: Outputs) -> list[tuple[Array, Array]]:
 
     Returns:
         Joint positions (n_joints,) of each arm [rad or m] at start and goal; an end that an arm
-            does not reach is left out.
+        does not reach is left out.
     """
     found = outputs(initial_decision(workcell.task)[None])
     return [

@@ -44,7 +44,7 @@ RESUME_HINT = "what was computed is kept: continue with --resume"
 
 
 def ignore_result(index: int, result: object) -> None:
-    """Do nothing; the default for calls without a function that handles results."""
+    """Do nothing with the result of a call: the default of `on_result` in `Workers.map`."""
 
 
 class Workers(ABC):
@@ -106,7 +106,11 @@ class LocalWorkers(Workers):
     """
 
     def __init__(self, jobs: int = 1) -> None:
-        """Set the largest number of processes, 0 for one per core; no process starts yet."""
+        """Set the largest number of processes; no process starts yet.
+
+        Args:
+            jobs: largest number of processes, 0 for one per core.
+        """
         self._jobs = jobs or available_cores()
         self._pool: ProcessPoolExecutor | None = None
         self._processes = set[BaseProcess]()

@@ -164,7 +164,7 @@ def _rows(file: gzip.GzipFile, width: int, most: int) -> tuple[Array, NDArray[np
 
     Returns:
         Numbers (n, width - 1) of the n candidates, and index (n,) of the constraint that each
-            violates first.
+        violates first.
     """
     reasons = {"": FEASIBLE, **{reason: k for k, reason in enumerate(REASONS)}}
     numbers, found = array("d"), array("b")

@@ -241,7 +241,7 @@ def open_folder(
 
 
 def require_usable(execution: ExecutionSettings) -> None:
-    """Check that the results folder can be used.
+    """Check that the results folder in the execution settings can be used.
 
     Raises:
         ResultsError: the folder contains a campaign and neither `resume` nor `overwrite` is set, or
@@ -271,8 +271,9 @@ _ELSEWHERE = "choose another --output, or remove those results with --overwrite"
 def _clear(root: Path) -> None:
     """Remove everything in a results folder.
 
-    Marks of finished stages are removed first and the configuration last. So after an interruption
-    no missing file seems finished, and the folder can be overwritten again.
+    Markers of finished stages are removed first and the configuration last. So after an
+    interruption no stage looks finished whose files are missing, and the folder can be overwritten
+    again.
     """
     order = {STAGES: 0, CONFIGURATION: 2}
     with storing(root):

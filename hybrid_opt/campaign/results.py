@@ -97,7 +97,7 @@ class Replica:
 
 @dataclass(frozen=True, repr=False)
 class CampaignResults:
-    """A campaign whose search is complete.
+    """Results of a campaign whose searches are all complete.
 
     Attributes:
         root: the results folder.

@@ -184,25 +184,39 @@ A drivable experiment polishes this front alone."""
 
 
 def replica_file(root: Path, algorithm: str, replica: int) -> Path:
-    """Return the file of the candidates of one replica, counted from 0."""
+    """Return the path of the file of all candidates of one replica.
+
+    Args:
+        root: the results folder.
+        algorithm: name of the search algorithm.
+        replica: number of the replica, from 0.
+    """
     return root / REPLICAS / algorithm / f"{replica:02d}.csv.gz"
 
 
 def selected_file(root: Path, algorithm: str, replica: int) -> Path:
-    """Return the trajectory file of the solution selected from one replica."""
+    """Return the path of the trajectory file of the carry that was selected from the front of one
+    replica.
+    """
     return root / SELECTED / algorithm / f"{replica:02d}.json"
 
 
 def polished_file(root: Path, algorithm: str, replica: int) -> Path:
-    """Return the file of the polished front of one replica, or of the `UNION`."""
+    """Return the path of the file of the polished front of one replica, or of the union of all
+    replicas if `algorithm` is `UNION`.
+    """
     return root / POLISHED_FOLDER / algorithm / f"{replica:02d}.json"
 
 
 def polished_selected_file(root: Path, algorithm: str, replica: int) -> Path:
-    """Return the trajectory file of the solution selected from a replica's polished front."""
+    """Return the path of the trajectory file of the carry selected from the polished front of one
+    replica.
+    """
     return root / SELECTED / f"{algorithm}{POLISHED_SUFFIX}" / f"{replica:02d}.json"
 
 
 def reference_front_file(root: Path) -> Path:
-    """Return the file of the non-dominated union of all fronts of the campaign."""
+    """Return the path of the file of the reference front: the non-dominated carries of all fronts
+    of the campaign.
+    """
     return root / FRONTS / "reference.csv"

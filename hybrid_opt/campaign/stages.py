@@ -128,7 +128,7 @@ def _mark(folder: CampaignFolder, stage: Stage, status: StageStatus, seconds: fl
 
 
 def check_stages(folder: CampaignFolder, stages: Sequence[Stage]) -> None:
-    """Check, before any work, that no stage began with other settings.
+    """Check, before any work, that every stage that has begun had the present settings.
 
     Raises:
         ResultsError: a stage began with other settings.
@@ -215,7 +215,7 @@ def decided_cell(
 
     Returns:
         Workcell with fixed start branches, and the competition that chose them; None for the latter
-            if the workcell file states the branches.
+        if the workcell file states the branches.
 
     Raises:
         DualArmError: no pair of branches can carry the box on any trajectory, or the stored choice
@@ -353,8 +353,12 @@ class ReadyCell:
 
     @classmethod
     def of(cls, objectives: tuple[str, ...], workcell: Workcell) -> ReadyCell:
-        """Load everything that a cell otherwise loads on first use, when its temporary files may be
-        gone.
+        """Load a cell with everything that it would otherwise load on first use: its files may be
+        temporary.
+
+        Args:
+            objectives: names of the cell's objectives.
+            workcell: the workcell, whose files exist during the call.
         """
         # Not imported at the top: other stages time nothing.
         from hybrid_opt.timing.path_timer import search_carry, search_timing

@@ -78,7 +78,7 @@ def _mesh(shape: ConvexShape) -> tuple[Array, NDArray[np.int64]]:
 
     Returns:
         Vertices (n, 3) in the frame of the shape [m], and faces (m, 3) as vertex indices, with
-            outward normals.
+        outward normals.
     """
     match shape:
         case Box():

@@ -235,7 +235,7 @@ def _displacement(job: Job, phase: Phase, late: int, delay: float) -> tuple[Arra
 
     Returns:
         Mask of the samples of the phase without repeated times; displacement (n, 3) [m] and contact
-            normal (n, 3) at these n samples, both in the world frame.
+        normal (n, 3) at these n samples, both in the world frame.
     """
     motion, contact = phase.motion, job.workcell.contacts[late]
     keep = np.concatenate([[True], np.diff(motion.time) > 0.0])

@@ -127,7 +127,7 @@ class Straight:
 
         Returns:
             Poses (n, 6) of the box, then places (n, 6) of the pad of each arm as box poses [m,
-                rad].
+            rad].
         """
         ways = np.concatenate([self.box[None], self.held])
         poses = ways[:, None, 0] + share[:, None] * (ways[:, 1] - ways[:, 0])[:, None]
@@ -168,7 +168,7 @@ def lines_around(
 
     Returns:
         Motions before the carry and motions after it; in each list the one next to the carry is
-            first.
+        first.
     """
     away, speed = handling.stand_off, handling.pressing_speed
     stand, down = (np.tile(box, (2, 1)) for box in stands)
@@ -465,7 +465,7 @@ def unit_squeeze(workcell: Workcell, pose: Array, leader: int = 0) -> Array:
 
     Returns:
         Change (n, 2, 6) of force [N/N] and moment about the robot's nominal contact point [N m/N],
-            world axes.
+        world axes.
     """
     if not contact_model(workcell).is_squeeze:
         return np.zeros((len(pose), 2, 6))
@@ -530,14 +530,15 @@ def phase_use(
 def joint_use(workcell: Workcell, q: Array, rate: Array, second: Array) -> dict[str, float]:
     """Compute the largest ratio of joint positions, velocities and accelerations to their limits.
 
+    A ratio of positions is 0 in the middle of the joint's range and 1 at its ends.
+
     Args:
         workcell: the workcell.
         q, rate, second: (n, joints) joint positions of both arms [rad], and their first and second
             time derivative.
 
     Returns:
-        Ratio by name: 'joint position', 'joint velocity', 'joint acceleration'. A position ratio of
-            0 is the middle of the joint's range, 1 an end of it.
+        Ratios by the names 'joint position', 'joint velocity' and 'joint acceleration'.
     """
     lower, upper = map(workcell.stack_joint_limits, ("position_lower", "position_upper"))
     return {

@@ -115,7 +115,7 @@ class StraightMotions:
 
         Yields:
             Side (0 before the carry, 1 after it), straight motion, and joint positions of both arms
-                (`PHASE_SAMPLES`, joints) [rad or m].
+            (`PHASE_SAMPLES`, joints) [rad or m].
 
         Raises:
             JobError: an arm does not reach a place within its joint range.
@@ -429,7 +429,7 @@ class JobModel:
 
         Returns:
             Straight motions, their phases before the carry, and their phases after it; each list
-                begins next to the carry. Results are cached for carries with the same ends.
+            begins next to the carry. Results are cached for carries with the same ends.
         """
         pose, q = carry.pose[[0, -1]], carry.q[[0, -1]].round(_SAME_POSTURE)
         key = handling, pose.tobytes() + q.tobytes()
@@ -455,7 +455,7 @@ class JobModel:
         return certificates(checker, self._posture, [path])[0]
 
     def _free(self, checker: CollisionChecker, line: Straight, motion: PhaseMotion) -> Certificate:
-        """Certify that a straight motion is free of collisions throughout."""
+        """Certify that a straight motion along a line is free of collisions throughout."""
         share = rest_to_rest_profile(1.0, PHASE_SAMPLES).value
 
         def at(u: Array) -> tuple[Array, Array, Array]:

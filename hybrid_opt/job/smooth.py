@@ -132,7 +132,13 @@ def driven_timing(model: TimingModel, x: Array) -> Timing:
 
 
 def _smoothed(model: TimingModel, timing: Timing, width: float) -> Timing:
-    """Average a timing over a window, and slow it down until it satisfies its limits."""
+    """Average a timing over a window, and slow it down until it satisfies its limits.
+
+    Args:
+        model: timing model of the workcell.
+        timing: timing with jumps of acceleration.
+        width: half the width of the window [s].
+    """
     u, rate, second = _averaged(timing.grid_speed, width)
     motion = model.path_motion(timing.driven.x).interpolate(u)
     limits = timing.limits

@@ -187,12 +187,12 @@ def commanded_at_most(force: float, others: Array | float = np.inf) -> Array:
 
 
 def duration_alone(duration: float, force: float) -> float:
-    """Return the duration [s] as the cost of an option."""
+    """Return the duration [s] of a timed path as its cost; the force [N] is ignored."""
     return duration
 
 
 def force_alone(duration: float, force: float) -> float:
-    """Return the commanded force [N] as the cost of an option."""
+    """Return the commanded force [N] of a timed path as its cost; the duration [s] is ignored."""
     return force
 
 

@@ -284,8 +284,14 @@ def _excess(
     """Return a function that maps a changed cell to the largest ratio of a required force to the
     reference force, minus one.
 
-    The required forces of the changed cell are its robust forces along `motion`, scaled by the
+    The required forces of the changed cell are its robust forces along the motion, scaled by the
     ratio of `required` to the robust forces of the unchanged cell.
+
+    Args:
+        model: computes robust forces of the unchanged cell.
+        motion: samples of the motion at which the required forces are largest.
+        required: (2,) required normal force of each robot in the unchanged cell [N].
+        allowed: (2,) reference force of each robot [N].
     """
     known = largest_forces(model, motion)
     rows = model.governing_rows(motion, model.workcell.uncertainty, LEADER)
@@ -326,8 +332,12 @@ def _stronger(required: Array, allowed: Array) -> Iterator[Remedy]:
 
 
 def _of_cell(workcell: Workcell, excess: Callable[[Workcell], float]) -> Iterator[Remedy]:
-    """Yield the smallest change of the mass, of the friction and of ranges of the uncertainty at
-    which `excess`, a function from `_excess`, is zero for the changed cell.
+    """Yield changes of a cell that bring its required forces within the reference forces: of the
+    mass, of the friction, and of ranges of the uncertainty, each as small as possible.
+
+    Args:
+        workcell: the cell.
+        excess: function of a changed cell from `_excess`, which is zero if the forces just fit.
     """
     payload, contacts, uncertainty = workcell.payload, workcell.contacts, workcell.uncertainty
 

@@ -302,7 +302,7 @@ class RobustModel:
 
         Returns:
             Slack (m,). A positive slack proves that the force holds the case; a negative slack
-                proves nothing.
+            proves nothing.
         """
         given = *motion_inputs(motion), cases, force
         return self._slack(1 - leader).batch(*given, threads=threads)["slack"].ravel()
@@ -359,7 +359,7 @@ class RobustModel:
 
         Returns:
             Commanded normal force (n,) [N], and the largest normal force (n,) of the leading arm in
-                any case [N]. Both are infinite at samples where no force holds every case.
+            any case [N]. Both are infinite at samples where no force holds every case.
 
         Raises:
             SettingsError: the uncertainty leaves no friction or contact patch.
@@ -378,6 +378,11 @@ class RobustModel:
 
         For each sample these are `GOVERNING_CASES` cases with the largest commanded forces, and as
         many in which the leading arm's force exceeds the commanded force most.
+
+        Args:
+            motion: box motion at n samples.
+            uncertainty: ranges of the uncertain quantities.
+            leader: index of the leading arm.
         """
         worst = self.least_squeeze(motion, self.worst_cases(uncertainty, leader), leader)
         command = worst[:, :, 1 - leader]
@@ -429,10 +434,16 @@ class RobustModel:
         return force
 
     def peak(self, motion: HeldMotion, uncertainty: Uncertainty, leader: int = 0) -> Array:
-        """Compute the largest normal force (2,) of each robot over a motion in any case [N].
+        """Compute the largest normal force (2,) [N] that each robot exerts over a motion in any
+        case of an uncertainty.
 
         The result is the maximum of the forces of `hold`, which are computed only at the few
         samples where the maximum can lie.
+
+        Args:
+            motion: box motion at n samples.
+            uncertainty: ranges of the uncertain quantities.
+            leader: index of the leading arm.
         """
         force, planned = self.commanded(motion, uncertainty, leader), self.nominal(motion, leader)
         share = self.leading_share[leader]
@@ -507,7 +518,15 @@ class RobustModel:
         threads: int = 1,
     ) -> Array:
         """Compute the ratio (k, n) of the force that each of k cases needs at n samples to the
-        commanded force (n,). Ratios below `screened` are returned as `screened`.
+        commanded force. Ratios below `screened` are returned as `screened`.
+
+        Args:
+            motion: box motion at n samples.
+            force: (n,) commanded normal forces [N].
+            cases: (k, 18) cases, each applied to all samples.
+            screened: least ratio that is computed.
+            leader: index of the leading arm.
+            threads: number of threads, 0 for one per core.
         """
         n, k = len(motion.pose), len(cases)
         displaced = bool(cases[:, 11:15].any())
@@ -540,7 +559,7 @@ class RobustModel:
 
         Returns:
             Factor from 0 to `LARGEST_FACTOR`; 0 if the forces without uncertainty exceed the
-                limits.
+            limits.
         """
         chosen = self.workcell.uncertainty
         end = allowed_factor(self.workcell, chosen)

@@ -124,9 +124,9 @@ class RobustPath:
             points: n points of paths.
 
         Returns:
-            Normal forces (n, 2) of both robots [N], and their slopes (n, 2, 20): derivatives with
-                respect to the pose (6), to its first and second derivative by u (12), to u'' and to
-                u'^2.
+            Normal forces (n, 2) of both robots [N], and their slopes (n, 2, 20). The columns of the
+            slopes are the derivatives with respect to the pose (6), to its first and second
+            derivative by u (12), to u'' and to u'^2.
         """
         least = self._model.least_squeeze(points.motion, self._cases, LEADER)
         governing = governing_cases(least, self._set, LEADER, leading_share=self._share)
@@ -174,7 +174,7 @@ class RobustPath:
 
         Returns:
             Normal forces (n, 2, count) of both robots [N], the largest commanded force first, and
-                their slopes (n, 2, count, 20) as in `at`.
+            their slopes (n, 2, count, 20) as in `at`.
         """
         n, least = len(points), self._model.least_squeeze(points.motion, self._cases, LEADER)
         governing = governing_cases(least, self._set, LEADER, leading_share=self._share)
@@ -289,11 +289,16 @@ class GoverningForce:
         return self._inputs(self._workcell, self._motion, pads=True)
 
     def _inputs(self, cell: Workcell, motion: BoxMotion, pads: bool) -> Array:
-        """Compute the inputs (k, m) with respect to which `_gradient` holds derivatives, in another
-        cell.
+        """Compute the m inputs of `_gradient` in another cell, for each of the k governing cases.
 
-        If `pads` is True and the pads' normals are not opposite, return the normal forces (k, 1) of
-        the force-controlled arm in the k governing cases [N] instead.
+        Args:
+            cell: the other cell.
+            motion: box motion in the other cell at `samples`.
+            pads: True if the other cell's pads differ from this cell's.
+
+        Returns:
+            Inputs (k, m). If `pads` is True and the pads' normals are not opposite, the normal
+            forces (k, 1) of the force-controlled arm [N] instead.
         """
         cases = worst_cases(command_model(cell), cell.uncertainty, self._leader)
         assert len(cases) == self._count, "no range of the uncertainty begins or ends"

@@ -81,7 +81,16 @@ def write_atomically(path: Path, content: bytes, remedy: str = RESUME) -> None:
 
 
 def write_json(path: Path, document: Any) -> None:
-    """Write JSON values to a file in one step; NaN and infinities raise a `ValueError`."""
+    """Write JSON values to a file in one step.
+
+    Args:
+        path: path of the file.
+        document: JSON values.
+
+    Raises:
+        ValueError: a number is NaN or infinite.
+        ResultsError: the file cannot be written.
+    """
     text = json.dumps(document, indent=1, allow_nan=False)
     write_atomically(path, (text + "\n").encode())
 
