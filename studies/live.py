@@ -29,7 +29,8 @@ def _add_options(parser: Parser) -> None:
 def serve(options: argparse.Namespace) -> int:
     """Serve a page on which a cell can be changed, until Ctrl-C. Return the exit code.
 
-    The first carry shown keeps within the reference force, if one is found that does.
+    The first carry shown is the hand-made path, with a force limit that keeps its commanded forces
+    within the reference forces if there is one.
 
     Raises:
         DualArmError: the cell has no drivable form, or the package viser is not installed.

@@ -31,13 +31,13 @@ change must have [N]."""
 
 @dataclass(frozen=True)
 class Fact:
-    """One line of an answer: a heading and a phrase.
+    """One line of an answer: a heading and a text.
 
     Attributes:
         heading: the subject of the line, as 'time' or 'file'.
         text: one phrase.
-        is_command: whether the text is a command to copy into a shell.
-        note: a remark that the page shows in smaller letters, '' for none.
+        is_command: True if the text is a command to copy into a shell.
+        note: remark that the page shows in smaller letters, '' for none.
     """
 
     heading: str
@@ -57,10 +57,9 @@ class StudyAnswer:
 
     Attributes:
         state: the verdict on the recommended carry.
-        headline: the carry in one line, or that there is none.
-        facts: what the first screen of the page shows: time, force, job, and whether the forces
-            hold.
-        commands: the trajectory file and the next command.
+        headline: the recommended carry in one line, or a statement that there is none.
+        facts: lines that the page shows first: time, force, job, and whether the forces hold.
+        commands: path of the trajectory file, and the command to run next.
         details: all other lines, the most important first.
         warnings: objections against the carry.
     """
@@ -95,7 +94,7 @@ def carry_text(duration: float, force: float, job_duration: float, order: str) -
 
 
 def job_text(job: Job) -> str:
-    """Return the carry of a planned job in one line of text."""
+    """Return the carry within a planned job in one line of text."""
     carried, squeeze = job.phase("carry").duration, job.squeeze
     return carry_text(carried, squeeze.force, job.duration, squeeze.order)
 
@@ -111,7 +110,7 @@ def newtons(force: float) -> str:
 
 
 def answer(found: StoredRecommendation, folder: str) -> StudyAnswer:
-    """Return a stored recommendation as the answer of a study.
+    """Convert a stored recommendation to the answer of a study in words.
 
     Args:
         folder: path of the results, put in front of the files' names; '' if it is the working
@@ -160,7 +159,7 @@ _WITHIN = "each alone, in every case within the reference force on this path"
 
 
 def state_of(found: StoredRecommendation) -> State:
-    """Return the verdict on a recommended carry: see `State`."""
+    """Return the verdict on a recommended carry, one of the values of `State`."""
     failing = found.price is not None and found.price.check.failing > 0
     if not found.fits or failing or not math.isfinite(found.job_duration):
         return "bad"
@@ -181,8 +180,8 @@ def _facts(found: StoredRecommendation) -> tuple[Fact, ...]:
 
 
 def holds_text(found: StoredRecommendation) -> str:
-    """Return a phrase that says whether a carry holds in every case of the uncertainty within the
-    reference forces."""
+    """Return a phrase that says whether the reference forces allow to hold the box in every case of
+    the uncertainty."""
     if not found.fits:
         return f"not within the reference force: {newtons(found.required)} are needed"
     if found.price is None:
@@ -194,11 +193,12 @@ def holds_text(found: StoredRecommendation) -> str:
 
 
 def export_command(path: Path, target: str) -> str:
-    """Return the shell command that exports the trajectory file at `path`, timed within the limits
-    stored in it.
+    """Return the shell command that exports a trajectory file, timed within the limits stored in
+    it.
 
     Args:
-        target: name of the export's target, as 'torque'.
+        path: path of the trajectory file.
+        target: name of the export's target, such as 'torque'.
     """
     output = path.with_name(f"{path.stem}-{target}")
     return (
@@ -208,8 +208,13 @@ def export_command(path: Path, target: str) -> str:
 
 
 def _rival(rival: Alternative, found: StoredRecommendation) -> str:
-    """Return a phrase that compares another path with the recommended carry: its duration at the
-    same force, and its force in the same duration."""
+    """Return a phrase on another path: its duration with the force of the recommended carry, and
+    its force in the duration of the recommended carry.
+
+    Args:
+        rival: figures of the other path.
+        found: the recommendation.
+    """
     duration, force = rival.duration_at_force, rival.force_at_duration
     same_force = "cannot be held with the same force"
     same_time = "cannot be driven in the same time"
@@ -224,8 +229,9 @@ def _rival(rival: Alternative, found: StoredRecommendation) -> str:
 
 
 def _checked(price: RobustPrice) -> str:
-    """Return a phrase about the robust forces: how many random cases slip, the set of cases, and
-    the largest multiple of that set which the reference forces would hold."""
+    """Return a phrase on robustness: how many random cases slip, the uncertainty, the leading arm's
+    largest force, and the largest multiple of the uncertainty that the reference forces would
+    hold."""
     slips = "slips" if price.check.failing == 1 else "slip"
     return (
         f"{price.check.failing or 'none'} of {price.check.cases} random cases {slips} "
@@ -239,8 +245,9 @@ def _percent(ratio: float) -> str:
 
 
 def _margins(found: StoredRecommendation) -> list[str]:
-    """Return phrases about the largest single deviations that the commanded force tolerates: the
-    share of the force that may be missing, and the error of the centre of mass along each axis."""
+    """Return phrases on how far single values may be off before the commanded force is too small:
+    the part of this force that may be missing, and the error of the centre of mass along each
+    axis."""
     texts = [
         f"up to {100.0 * margin.limit:.0f} % of it may be missing"
         for margin in found.margins

@@ -52,12 +52,13 @@ from symbolic.records import Task, Workcell
 
 @dataclass(frozen=True)
 class StoredDurations:
-    """Shortest durations of one row of a `ForceTable`.
+    """Shortest durations of one path, or of a whole front, at the forces of a `ForceTable`.
 
     Attributes:
-        label: name of a path, or `FRONT` for all paths that the carry was chosen from.
-        durations: one per force of the table [s], limits on jerk ignored; null where no path can be
-            driven with that force.
+        label: name of the path, or `FRONT` for all paths from which the recommended carry was
+            chosen.
+        durations: shortest duration for each force [s], limits on jerk ignored; null if no path can
+            be driven with that force.
     """
 
     label: str
@@ -66,13 +67,13 @@ class StoredDurations:
 
 @dataclass(frozen=True)
 class ForceTable:
-    """Shortest durations of some paths at the same commanded forces.
+    """Shortest durations of several paths at the same commanded forces.
 
     Attributes:
-        forces: largest normal forces to command of the force-controlled arm [N]; the last one is
-            the reference force.
-        rows: one each for the hand-made path, the recommended path, the least-force path of the
-            other experiment if there is one, and the whole front.
+        forces: largest commanded normal forces of the force-controlled arm [N]; the last one is the
+            reference force.
+        rows: one row each for the hand-made path, the recommended path, the path of least force
+            from the study's first experiment if there is one, and the whole front.
     """
 
     forces: tuple[float, ...]
@@ -85,43 +86,43 @@ EXPORT_TARGET = "torque"
 
 @dataclass(frozen=True)
 class StoredRecommendation:
-    """recommendation.json: the carry to run, with all figures that reports show of it.
+    """Content of recommendation.json: the recommended carry, with all figures that reports show of
+    it.
 
     Attributes:
-        wish, why: what the carry was to be best at, as values and as text.
-        source: the search that found it, as 'NSGA-II, polished, replica 3'.
-        file: path of its trajectory file, relative to the results folder.
-        duration: of the carry as robots drive it, limits on jerk kept [s].
-        force: the largest normal force to command of the force-controlled arm [N].
-        parts: contributions whose sum is the force.
-        job_duration: of the whole job [s], null where none can be planned.
-        force_limit: the force limit of the search that the carry was timed with [N].
+        wish, why: what the carry should be best at, as values and as text.
+        source: search that found the carry, such as 'NSGA-II, polished, replica 3'.
+        file: path of the carry's trajectory file, relative to the results folder.
+        duration: duration of the carry as robots drive it, within limits on jerk [s].
+        force: largest commanded normal force of the force-controlled arm [N].
+        parts: contributions that add up to `force`.
+        job_duration: duration of the whole job [s]; null if none can be planned.
+        force_limit: force limit with which the carry is timed [N].
         peak_force: largest planned normal force of each robot [N].
-        robust_force: largest normal force of each robot in every case of the workcell's uncertainty
-            [N], if force limits apply to robust forces; else null.
-        without_jerk: duration without the cell's limits on jerk [s], null where there are none.
-        squeeze, squeeze_reason: largest normal force to command of each robot [N], and how it was
+        robust_force: (2,) largest normal force of each robot in every case of the uncertainty [N],
+            if the force limit applies to such forces; else null.
+        without_jerk: duration without limits on jerk [s]; null if the cell has none.
+        squeeze, squeeze_reason: largest commanded normal force of each robot [N], and how it was
             chosen.
-        order: words before the force in texts, as 'press with'.
-        target: target of the export command that the study prints.
-        payload_limit: largest payload that the robots bear on the same motion with planned forces,
-            if nothing is uncertain [kg].
-        rivals: other paths, compared at the same force and in the same time, the hand-made one
-            first.
-        margins: largest errors of the cell's description that the commanded force tolerates.
-        advice: effects that changes of the cell would have on the force.
+        order: words before the force in texts, such as 'press with'.
+        target: name of the export's target in the command that the study prints.
+        payload_limit: largest mass that the robots can carry on the same motion within the
+            reference forces, by planned forces [kg].
+        rivals: other paths, the hand-made one first: their durations at the same force, and their
+            forces in the same time.
+        margins: largest errors of single values of the cell's description that `force` tolerates.
+        advice: changes of the cell and their effects on the force.
         warnings: objections against the carry.
-        considered: number of carries that it was chosen from.
+        considered: number of carries among which the recommended one was chosen.
         durations: shortest durations of some paths at the same commanded forces.
-        price: the price of robustness, null for a cell without uncertainty.
-        required: largest normal force of either arm in any case of the uncertainty, commanded or
-            resulting [N].
-        allowed: (2,) reference force of each robot [N], null if unknown.
+        price: growth of the forces with the uncertainty; null for a cell without uncertainty.
+        required: largest normal force of either arm in any case of the uncertainty [N].
+        allowed: (2,) reference force of each robot [N]; null if unknown.
         at_rest: the grip budget of the cell at rest, as text.
         remedies: the smallest changes with which the reference forces would allow the carry, if
             they do not.
         reserve: heaviest box and least friction that the reference forces allow in every case of
-            the uncertainty, null if unknown.
+            the uncertainty; null if unknown.
     """
 
     wish: ho.Wish
@@ -161,36 +162,37 @@ class StoredRecommendation:
 
     @property
     def fits(self) -> bool:
-        """True if the carry holds in every case of the uncertainty within the reference forces."""
+        """True if the reference forces allow to hold the box in every case of the uncertainty."""
         return not self.remedies
 
     @property
     def force_kind(self) -> ForceKind:
-        """Kind of normal forces, planned or robust, that force limits, the force table and the
-        rivals refer to."""
+        """Kind of the normal forces, planned or robust, to which the force limit applies. The force
+        table and `rivals` use the same kind."""
         return PLANNED_FORCE if self.robust_force is None else ROBUST_FORCE
 
     @property
     def limited_force(self) -> Array:
-        """(2,) largest normal force of each robot that the force limit applies to, planned or
-        robust [N]."""
+        """(2,) largest normal force of each robot, of the kind to which the force limit applies
+        [N]."""
         return self.peak_force if self.robust_force is None else self.robust_force
 
 
 @dataclass(frozen=True)
 class NoRecommendation:
-    """no-recommendation.json: the reason why a study has no carry to run."""
+    """Content of no-recommendation.json: the reason why a study recommends no carry."""
 
     reason: str
 
 
 def recommendation_stage(wish: ho.Wish, target: str) -> Stage:
-    """Return the stage of a study that recommends a carry. The stage writes `recommended.json`, a
-    trajectory file, and `recommendation.json`; without a drivable carry only
-    `no-recommendation.json`.
+    """Return the stage of a study that recommends a carry.
+
+    It writes `recommended.json`, a trajectory file, and `recommendation.json`. If there is no
+    drivable carry it writes `no-recommendation.json` only.
 
     Args:
-        wish: what the carry is to be best at.
+        wish: what the carry should be best at.
         target: name of the export's target in the command that the study prints.
     """
 
@@ -211,8 +213,8 @@ def recommendation_stage(wish: ho.Wish, target: str) -> Stage:
 
 
 def read_recommendation(root: Path) -> StoredRecommendation | NoRecommendation | None:
-    """Read the recommendation in a results folder, or the reason why there is none; return None if
-    the folder has neither file.
+    """Read the recommendation of a study from its results folder, or the reason why there is none.
+    Return None if the folder has neither.
 
     Raises:
         ResultsError: the file is damaged.
@@ -233,16 +235,16 @@ def recommend_from(
     target: str = EXPORT_TARGET,
     threads: int = 0,
 ) -> StoredRecommendation:
-    """Recommend a carry from the drivable fronts of a study, write its trajectory file, and return
-    the recommendation.
+    """Choose a carry from the drivable fronts of a study and write its trajectory file. Return the
+    recommendation.
 
     Args:
-        root: the results folder, in which the drivable experiment is finished.
-        wish: what the carry is to be best at.
-        path: the trajectory file to write.
-        target: name of the export's target, which the recommendation stores.
-        threads: number of threads that time carries, 0 for one per core; results do not depend on
-            it.
+        root: results folder of the study, whose drivable experiment is finished.
+        wish: what the carry should be best at.
+        path: path of the trajectory file.
+        target: name of the export's target, stored in the recommendation.
+        threads: number of threads that time carries, 0 for one per core; it has no influence on the
+            result.
 
     Raises:
         NoCarryError: no drivable carry was found; the message says why.
@@ -319,17 +321,17 @@ def recommend_from(
 
 
 def _hand_made(cell: ho.Cell) -> Array:
-    """Return the hand-made trajectory as a decision vector (1, n_var) with the largest force limit
-    of the bounds, or (0, n_var) if that is not feasible. It takes part because the front of a short
-    search may be worse."""
+    """Return the hand-made trajectory with the largest possible force limit as decision vectors (1,
+    n_var); (0, n_var) if it is not feasible. It takes part in the choice because the front of a
+    short search may be worse."""
     x = np.append(cell.initial[:-1], cell.workcell.task.force_limit[1])
     found = cell.evaluator.certified(cell.evaluate(x))
     return np.asarray(found.x[found.feasible])
 
 
 def _why_none(cell: ho.Cell, results: CampaignResults) -> str:
-    """Return a text that says which constraints the candidates of an experiment violated, and why
-    its hand-made trajectory cannot be driven."""
+    """Return a text on why no drivable carry was found: the constraints that candidates violated,
+    and why the hand-made trajectory cannot be driven."""
     found = concatenated([replica.evaluations for replica in results.replicas])
     stopped = ", ".join(
         f"{name.replace('_', ' ')} {100.0 * count / len(found):.1f} %"
@@ -352,9 +354,18 @@ def _force_table(
     found: Recommendation,
     advance: Advance,
 ) -> ForceTable:
-    """Compute the shortest durations of the hand-made path, the recommended path, other paths, and
-    the front of the carries x (k, n_var), at some commanded forces that include the recommended
-    carry's."""
+    """Compute the shortest durations of several paths at some commanded forces, among them that of
+    the recommended carry.
+
+    Args:
+        cell: the drivable cell.
+        x: (k, n_var) carries from which the recommended one was chosen; they give the row of the
+            front.
+        others: further paths (n_path,) by name, in addition to the hand-made and the recommended
+            one.
+        found: the recommendation.
+        advance: function that is called after each row.
+    """
     n = cell.workcell.task.n_path
     forces = np.unique(np.append(table_forces(cell.workcell), found.force))
     paths = {HAND_MADE: cell.initial[:n], "recommended": found.x[:n]} | dict(others)
@@ -377,13 +388,15 @@ carry is compared with it."""
 
 
 def known_paths(root: Path, task: Task) -> Array:
-    """Return paths (m, n_path) from the results of an experiment, converted to the waypoints of
-    another search's task: the balanced path of all fronts, and the first, middle and last path of
-    every polished front.
+    """Return good paths of a finished experiment as starts of another search: the balanced path of
+    all fronts, and the first, middle and last path of each polished front.
 
     Args:
-        root: results folder of the finished experiment.
-        task: the task of the other search.
+        root: results folder of the experiment.
+        task: task of the other search, to whose waypoints the paths are converted.
+
+    Returns:
+        (m, n_path) paths.
 
     Raises:
         ResultsError: the experiment's folder is not complete or damaged.
@@ -397,9 +410,16 @@ def known_paths(root: Path, task: Task) -> Array:
 
 
 def least_force(campaign: CampaignResults, task: Task) -> dict[str, Array]:
-    """Return a dictionary from `LEAST_FORCE_PATH` to the balanced path (n_path,) of all fronts of
-    an experiment, converted to the waypoints of `task`; an empty one if the experiment found no
-    carry."""
+    """Find the balanced path of all fronts of an experiment.
+
+    Args:
+        campaign: results of the experiment.
+        task: task to whose waypoints the path is converted.
+
+    Returns:
+        The path (n_path,) under the key `LEAST_FORCE_PATH`; an empty dictionary if the experiment
+        found no carry.
+    """
     evaluator = CandidateEvaluator(campaign.workcell, campaign.objectives)
     chosen = select(evaluator, np.concatenate([front.x for front in campaign.fronts]))
     if chosen is None:
@@ -409,12 +429,22 @@ def least_force(campaign: CampaignResults, task: Task) -> dict[str, Array]:
 
 
 def is_drivable(workcell: Workcell, objectives: Sequence[str]) -> bool:
-    """Return True if an experiment of this workcell and these objectives already searches for
-    carries as robots drive them."""
+    """Return True if an experiment already searches for carries as robots drive them.
+
+    Args:
+        workcell: cell of the experiment.
+        objectives: names of its objectives.
+    """
     return workcell.task.law.is_drivable and tuple(objectives) in DRIVABLE_PAIRS
 
 
 def drivable_root(root: Path, workcell: Workcell, objectives: Sequence[str]) -> Path:
-    """Return the folder of a study's drivable experiment: `root` itself if the study's first
-    experiment, of this workcell and these objectives, already is drivable; else a folder inside."""
+    """Return the results folder of a study's drivable experiment: the study's own folder if its
+    first experiment is drivable, else a folder inside.
+
+    Args:
+        root: results folder of the study.
+        workcell: cell of the first experiment.
+        objectives: names of the objectives of the first experiment.
+    """
     return root if is_drivable(workcell, objectives) else root / DRIVABLE

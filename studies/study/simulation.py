@@ -58,25 +58,28 @@ MOST_SAMPLES = 240
 
 @dataclass(frozen=True)
 class StoredSimulation:
-    """simulated/*.json: the result of one carry in the simulated cell.
+    """Content of a file in `simulated/`: result of one carry in the simulated cell.
 
     Attributes:
         label: name of the carry.
         trajectory: SHA-256 of the carry's trajectory file.
         controller: name of the control law of both arms.
-        problem: why there is no threshold or no simulation, '' if there is one; without a
-            simulation the other values are the defaults.
-        duration: of the carry [s].
-        slips, holds: multiples of the planned forces right below and right above the threshold of
-            slipping, null where there is none.
-        pad, begins: the pad that slips first right below the threshold, 1 or 2, 0 for none, and
-            when it does [s].
-        robust: True if the stored run presses with robust forces.
-        factor: multiple of the planned forces in the stored run, null with robust forces.
-        arrives: True if the box was held in the stored run and ended at its goal.
-        slip, misses: largest slip of a pad, and final distance of the box from its goal [m].
-        time: (n,) times of the samples from the beginning of the carry [s].
-        predicted, simulated: (n, 2) reference and measured normal force of each robot [N].
+        problem: reason why there is no threshold or no simulation, else ''. Without a simulation
+            the other values are the defaults.
+        duration: duration of the carry [s].
+        slips, holds: factors of the planned forces just below and just above the threshold of
+            slipping; null if there is none.
+        pad, begins: number of the pad that slips first just below the threshold, 1 or 2, 0 for
+            none; and the time at which it begins to slip [s].
+        robust: True if the stored simulation uses forces that hold in every case of the
+            uncertainty.
+        factor: factor of the planned forces in the stored simulation; null with robust forces.
+        arrives: True if the box did not slip in the stored simulation and ended at its goal.
+        slip, misses: largest slip of a pad and final distance of the box from its goal, in the
+            stored simulation [m].
+        time: (n,) times from the beginning of the carry [s].
+        predicted, simulated: (n, 2) commanded and measured normal force of each robot in the stored
+            simulation [N].
     """
 
     label: str
@@ -104,16 +107,16 @@ class StoredSimulation:
 
     @property
     def peaks(self) -> Array:
-        """(2, 2) largest predicted (row 0) and simulated (row 1) normal force of each robot [N],
-        NaN without samples."""
+        """(2, 2) largest commanded (row 0) and measured (row 1) normal force of each robot [N]; NaN
+        without samples."""
         if not len(self.time):
             return np.full((2, 2), np.nan)
         return np.stack([self.predicted.max(axis=0), self.simulated.max(axis=0)])
 
     @property
     def largest_error(self) -> float:
-        """Largest difference of a simulated from the predicted normal force, relative to the
-        predicted one, over samples and robots; NaN without samples."""
+        """Largest difference of a measured from the commanded normal force, over the commanded
+        force; NaN without samples."""
         if not len(self.time):
             return float("nan")
         return float(np.abs(self.simulated / self.predicted - 1.0).max())
@@ -122,8 +125,8 @@ class StoredSimulation:
 def stored_simulation(
     found: CarrySimulation, label: str, trajectory: str, controller: str
 ) -> StoredSimulation:
-    """Convert the result of a simulation to the stored record; samples before the beginning of the
-    carry are left out.
+    """Convert the result of a simulation to the record that is stored. Samples before the beginning
+    of the carry are left out.
 
     Args:
         found: result of the simulation.
@@ -182,7 +185,7 @@ class SimulationRequest:
     """A carry to simulate.
 
     Attributes:
-        name: name of the file in `simulated/`, without suffix.
+        name: name of the file in `simulated/` to be written, without suffix.
         label: name of the carry in tables and pictures.
         trajectory: the content of the carry's trajectory file.
         digest: SHA-256 of that file.
@@ -195,8 +198,8 @@ class SimulationRequest:
 
 
 def simulation_stage() -> Stage:
-    """Return the stage of a study that simulates every carry that the report shows, and writes one
-    file each in `simulated/`."""
+    """Return the stage of a study that simulates every carry of the report and writes a file in
+    `simulated/` for each."""
     return Stage("simulation", _run, {"control": CONTROL})
 
 
@@ -223,8 +226,13 @@ def _file(root: Path, name: str) -> Path:
 
 
 def is_done(root: Path, one: SimulationRequest) -> bool:
-    """Return True if the results in `root` hold a simulation of exactly this trajectory with the
-    present control law."""
+    """Return True if a simulation of exactly this trajectory with the present control law is
+    stored.
+
+    Args:
+        root: results folder of the study.
+        one: the requested simulation.
+    """
     try:
         stored = read_record(StoredSimulation, _file(root, one.name), "")
     except ResultsError:
@@ -266,8 +274,12 @@ def _simulated(one: SimulationRequest) -> StoredSimulation:
 def _simulated_hands(
     carry: Carry, label: str, trajectory: str, controller: str
 ) -> StoredSimulation:
-    """Find the threshold of a carry in hands without arms, and simulate it with the robust
-    forces."""
+    """Simulate a carry in hands without arms: find the least factor of its planned forces that
+    holds the payload, and run it with the forces that hold in every case of the uncertainty.
+
+    Args:
+        trajectory: SHA-256 of the carry's trajectory file.
+    """
     threshold, workcell = hand_threshold(carry), carry.workcell
     robust = commanded_forces(workcell, carry, SqueezeSettings(), itemised=False)[0].max(axis=0)
     motion = carriage_motion(carry, HAND_SETTINGS)
@@ -301,14 +313,14 @@ curve."""
 
 
 def timing_stage(curves: bool = True) -> Stage:
-    """Return the stage of a study that times the selected trajectories as robots drive them, and
-    writes one file each in `timing/`.
+    """Return the stage of a study that times the selected trajectories as robots drive them and
+    writes a file in `timing/` for each.
 
     If the union of all fronts was polished, only the trajectory selected from the union and those
     that a report shows are timed.
 
     Args:
-        curves: whether trajectories that a report shows are also timed at many force limits.
+        curves: True to time trajectories that a report shows at many force limits too.
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:
@@ -342,12 +354,12 @@ def _document(cells: Cells, request: Request) -> TimingDocument:
 
 
 def limits_on_jerk(root: Path, recommended: StoredRecommendation | None) -> Table | None:
-    """Return the table of durations with and without the cell's limits on jerk: of the selected
-    carries, the hand-made one first, and of the recommended carry. None where no jerk is limited.
+    """Return a table of durations with and without the cell's limits on jerk, for the hand-made,
+    the selected and the recommended carries. None if the cell limits no jerk.
 
     Args:
         root: results folder of the drivable experiment.
-        recommended: the recommended carry, None without one.
+        recommended: the recommended carry; None without one.
 
     Raises:
         ResultsError: a timing is damaged.
@@ -381,8 +393,11 @@ def limits_on_jerk(root: Path, recommended: StoredRecommendation | None) -> Tabl
 
 
 def file_label(path: Path) -> str:
-    """Return the name of a trajectory for tables, made of the path of its file relative to the
-    folder of selected trajectories, as 'NSGA-II, polished'."""
+    """Return the name of a trajectory for tables, such as 'NSGA-II, polished'.
+
+    Args:
+        path: path of the trajectory file, relative to the folder of selected trajectories.
+    """
     if len(path.parts) == 1:
         return path.stem
     folder = path.parts[0]

@@ -67,18 +67,18 @@ Share = Annotated[float, Range(0.0, 1.0)]
 
 @dataclass(frozen=True)
 class SelectedEntry:
-    """Figures of the solution selected from a front, or of the hand-made trajectory.
+    """Figures of the carry selected from a front, or of the hand-made trajectory.
 
     Attributes:
         evaluation: number of the candidate in the order of evaluation, from 1; 0 for the hand-made
-            one.
+            trajectory.
         file: path of the trajectory file, relative to the results folder; None without a file.
         objectives: (n_obj,) values of the objectives.
         peak_normal_force, minimum_normal_force: largest and least normal force of each robot [N].
-        excess_above_static: (2,) peak of each robot above the force of the level payload at rest
-            [%].
-        payload_limit: largest payload that both robots bear on the same motion [kg].
-        duration: of the carry [s].
+        excess_above_static: (2,) largest normal force of each robot above its force for the level
+            payload at rest [%].
+        payload_limit: largest payload that both robots can carry on the same motion [kg].
+        duration: duration of the carry [s].
         feasible: whether the trajectory satisfies all constraints.
     """
 
@@ -94,22 +94,22 @@ class SelectedEntry:
 
     @property
     def mean_excess_above_static(self) -> float:
-        """Mean over both robots of the peak force above that of the level payload at rest [%]."""
+        """Mean of `excess_above_static` over both robots [%]."""
         return float(self.excess_above_static.mean())
 
 
 @dataclass(frozen=True)
 class FrontFigures:
-    """Indicators of a front, and the solution selected from it.
+    """Indicators of a front, and the carry selected from it.
 
     Attributes:
         non_dominated: number of points of the front.
         hypervolume, igd, igd_plus, spacing: indicators as defined in
             `hybrid_opt.indicators.metrics`.
-        mean_excess_above_static: of the selected solution, mean of both robots' peak forces above
-            the forces at rest [%].
-        payload_limit: largest payload of the selected solution [kg].
-        selected: the selected solution, None where no candidate is feasible.
+        mean_excess_above_static: excess of the selected carry's largest normal forces over the
+            forces at rest, mean of both robots [%].
+        payload_limit: largest payload on the motion of the selected carry [kg].
+        selected: the selected carry; None without a feasible candidate.
     """
 
     non_dominated: Count
@@ -135,11 +135,10 @@ class ReplicaFigures(FrontFigures):
         replica: number of the replica, from 0.
         evaluations, feasible, feasible_share: number of candidates, and number and share of
             feasible ones.
-        seconds: duration of the search.
+        seconds: duration of the search [s].
         infeasible_by_reason: number of candidates by the constraint violated first.
-        best_so_far: one row for every evaluation that improved an objective: the number of the
-            evaluation, then the best value of each objective up to it.
-        polished: figures of the polished front, None where the replica's front was not polished.
+        best_so_far: rows of `best_steps`: number of an evaluation, then best values up to it.
+        polished: figures of the polished front; None without a polish.
     """
 
     replica: Count
@@ -167,8 +166,8 @@ class AlgorithmFigures:
     """Figures of one algorithm.
 
     Attributes:
-        representative: number of the replica with the largest hypervolume, None if no replica found
-            a feasible candidate.
+        representative: number of the replica with the largest hypervolume; None without a feasible
+            candidate.
         statistics: statistics over the replicas by the name of the figure.
         replicas: the replicas in order.
         polished: statistics of the polished fronts, None where they were not all polished.
@@ -202,12 +201,12 @@ class StoredFront:
 
 @dataclass(frozen=True)
 class NormalisationBounds:
-    """Bounds of the decision variables that members of the best fronts lie on.
+    """Bounds of the decision variables on which points of the best fronts lie.
 
     Attributes:
-        solutions: number of members: of the polished union if there is one, else of the fronts of
-            all replicas, polished where they were.
-        binding: the bounds that at least one member lies on.
+        solutions: number of points: of the polished union if there is one, else of the final fronts
+            of all replicas.
+        binding: bounds on which at least one point lies.
     """
 
     solutions: Count
@@ -221,8 +220,8 @@ class CampaignSummary:
     Attributes:
         robots: names of both robots, in the order of all pairs of values.
         hand_made: the workcell file's initial trajectory, None if not all its figures are finite.
-        union: the polished union of all fronts of a drivable experiment, None without a polish.
-        recommendation: the carry to run, None where the study recommends none.
+        union: polished union of all fronts of a drivable experiment; None without one.
+        recommendation: the recommended carry; None without one.
         no_recommendation: the reason why none is recommended; '' if one is, or if the experiment is
             the drivable part of another study, which recommends.
     """
@@ -326,8 +325,8 @@ exact test can reach, 2 / binomial(2 n, n), is 0.028 or more before any correcti
 
 
 def reference_front(fronts: Sequence[Array]) -> Array:
-    """Return the non-dominated points (k, n_obj) of the union of fronts. That of all fronts of a
-    campaign is the reference of the IGD."""
+    """Return the non-dominated points (k, n_obj) of the union of fronts, each (n, n_obj). From all
+    fronts of a campaign follows the reference of the IGD."""
     return metrics.front_of(np.concatenate(fronts))
 
 
@@ -384,9 +383,9 @@ def replica_figures(
 
 
 def best_steps(history: Array) -> tuple[Array, ...]:
-    """Return one row for every evaluation at which the best value of an objective changed: the
-    number of the evaluation from 1, then the best value of each objective. `history` (n, n_obj)
-    holds the best values after every evaluation, NaN before the first feasible one."""
+    """Return a row for every evaluation that changed the best value of an objective: its number
+    from 1, then the best value of each objective. `history` (n, n_obj) holds the best values after
+    every evaluation, NaN before the first feasible candidate."""
     known = history[~np.isnan(history).any(axis=1)]
     first = len(history) - len(known)
     changes = np.flatnonzero((np.diff(known, axis=0) != 0.0).any(axis=1)) + 1
@@ -395,7 +394,7 @@ def best_steps(history: Array) -> tuple[Array, ...]:
 
 
 def carry_entry(carry: Carry, evaluation: int, file: str | None) -> SelectedEntry:
-    """Return the summary's record of a judged carry.
+    """Return the summary's record of an evaluated carry.
 
     Args:
         evaluation: number of the candidate in the order of evaluation, from 1; 0 for the hand-made
@@ -470,8 +469,8 @@ def _algorithm_figures(rows: Sequence[ReplicaFigures]) -> AlgorithmFigures:
 
 
 def _tests(entries: Mapping[str, Sequence[ReplicaFigures]]) -> tuple[RankTest, ...]:
-    """Return rank tests of every pair of algorithms in every figure of `TESTED`, with p-values
-    corrected by Holm as one family. Empty with fewer than `LEAST_TESTED` replicas."""
+    """Compare every pair of algorithms in every figure of `TESTED` by rank tests, with p-values
+    corrected together by Holm's method. Empty with fewer than `LEAST_TESTED` replicas."""
     if any(len(rows) < LEAST_TESTED for rows in entries.values()):
         return ()
     pairs = [(figure, *pair) for pair in itertools.combinations(entries, 2) for figure in TESTED]
@@ -495,7 +494,7 @@ PERCENTILES = (25.0, 50.0, 75.0, 100.0)
 
 def summary_stage(not_asked: str = "") -> Stage:
     """Return the stage of a study that computes summary.json of a finished search. `not_asked` is
-    the reason that the summary states where no recommendation was requested."""
+    the reason that the summary states if no recommendation was requested, else ''."""
 
     return Stage("summary", partial(_run, not_asked=not_asked))
 
@@ -588,7 +587,7 @@ def _store_selected(
 
 
 def _store(folder: CampaignFolder, path: Path, carry: Carry, provenance: Mapping[str, Any]) -> str:
-    """Write the trajectory file of a judged carry, and return its path relative to the results
+    """Write the trajectory file of an evaluated carry. Return its path relative to the results
     folder."""
     with storing(path):
         path.parent.mkdir(parents=True, exist_ok=True)

@@ -69,15 +69,14 @@ def study_tables(
     simulations: Sequence[StoredSimulation] = (),
     with_paper: bool = False,
 ) -> tuple[Table, ...]:
-    """Return the tables of a study that can be made from its stored documents alone, without its
-    workcell.
+    """Return those tables of a study that need its stored documents only, not its workcell.
 
     Args:
-        summary: of the study's first experiment.
-        drivable: summary of a second, drivable experiment, None without one.
-        jerk: the table of `studies.study.simulation.limits_on_jerk`, None without one.
-        simulations: simulated carries.
-        with_paper: whether rows with the paper's values stand beside those of the study.
+        summary: summary of the study's first experiment.
+        drivable: summary of a second, drivable experiment; None without one.
+        jerk: table from `studies.study.simulation.limits_on_jerk`; None without one.
+        simulations: results of carries in the simulated cell.
+        with_paper: True to add rows with the paper's values.
     """
     found = summary.recommendation
     tables = [quality(summary, with_paper), selected(summary, with_paper)]
@@ -105,11 +104,11 @@ def quality(
     name: str = "table1_quality",
     heading: str = "Table 1. Quality of the search.",
 ) -> Table:
-    """Return the table of the fronts' indicators, over the replicas of each algorithm (paper Table
-    1).
+    """Return the table of the indicators of fronts, for each algorithm over its replicas (paper
+    Table 1).
 
     Args:
-        with_paper: whether rows with the paper's values are added.
+        with_paper: True to add rows with the paper's values.
         name: name of the table's file, without suffix.
         heading: sentence above the table.
     """
@@ -136,8 +135,16 @@ def quality(
 
 
 def _variants(name: str, entry: AlgorithmFigures) -> list[tuple[str, list[FrontFigures]]]:
-    """Return the rows of an algorithm: a label and the figures of all replicas as searched; and, if
-    they were polished, a label and the figures of the polished fronts."""
+    """Return the rows of one algorithm in a table: the fronts of its search and, if they were
+    polished, the polished fronts.
+
+    Args:
+        name: name of the algorithm.
+        entry: figures of the algorithm.
+
+    Returns:
+        For each row a label and the figures of all replicas.
+    """
     found: list[tuple[str, list[FrontFigures]]] = [(title(name), list(entry.replicas))]
     polished = [row.polished for row in entry.replicas if row.polished is not None]
     return found + ([(f"{title(name)} + polish", list(polished))] if polished else [])
@@ -147,14 +154,22 @@ _OF_UNION = "Union: the non-dominated candidates of all replicas, polished as on
 
 
 def _polished_union(summary: CampaignSummary) -> list[tuple[str, list[FrontFigures]]]:
-    """Return one row, a label and the figures of the polished union of a drivable experiment's
-    fronts; an empty list without one."""
+    """Return a row for the union of a drivable experiment's fronts that was polished as one front.
+
+    Returns:
+        One label with the figures of the union; empty without such a union.
+    """
     return [] if summary.union is None else [(f"{UNION} + polish", [summary.union])]
 
 
 def _over_replicas(figures: Sequence[FrontFigures], key: str, mean: bool = False) -> str:
-    """Return the text of a figure over replicas: median and quartiles, or mean and standard
-    deviation if `mean`. A dash where the records have no such figure."""
+    """Format a figure over replicas: median and quartiles, or mean and standard deviation.
+
+    Args:
+        figures: figures of each replica.
+        key: name of the figure; a dash is returned if the records lack it.
+        mean: True for mean and standard deviation.
+    """
     if not hasattr(figures[0], key):
         return NOTHING
     found, quantity = summarise([getattr(row, key) for row in figures]), REPLICA_QUANTITIES[key]
@@ -170,15 +185,23 @@ def _table(
     of: Iterable[Any],
     note: str,
 ) -> Table:
-    """Return a table with one row per record of `of`; `columns` maps the heading of a column to the
-    function that makes the text of a record's cell."""
+    """Build a table with one row per record.
+
+    Args:
+        columns: function that makes the text of a cell from a record, by the heading of the column.
+        of: the records.
+        note: text below the table.
+    """
     rows = tuple(tuple(told(one) for told in columns.values()) for one in of)
     return Table(name, heading, tuple(columns), rows, note)
 
 
 def selected(summary: CampaignSummary, with_paper: bool) -> Table:
-    """Return the table of normal forces of the selected trajectories (paper Table 2). `with_paper`
-    adds rows with the paper's values."""
+    """Return the table of the normal forces of the selected trajectories (paper Table 2).
+
+    Args:
+        with_paper: True to add rows with the paper's values.
+    """
     rows = [_forces("hand-made", summary.hand_made)]
     for name, entry in summary.algorithms.items():
         if entry.representative is None:
@@ -235,8 +258,7 @@ def _pressed(
 
 
 def replicas(summary: CampaignSummary) -> Table:
-    """Return the table of the carries selected from all replicas, and of what the polish
-    improved."""
+    """Return the table of the carries selected from each replica, before and after the polish."""
     rows, keys = [], ("mean_excess_above_static", "payload_limit")
     for name, entry in summary.algorithms.items():
         for label, figures in _variants(name, entry):
@@ -285,8 +307,8 @@ def _solvers(summary: CampaignSummary) -> str:
 
 
 def infeasible(summary: CampaignSummary) -> Table:
-    """Return the table of the constraints that made candidates infeasible, in percent of each
-    algorithm's candidates."""
+    """Return the table of the constraints that infeasible candidates violated first, in percent of
+    all candidates of each algorithm."""
     shares: dict[str, dict[str, float]] = {}
     for name, entry in summary.algorithms.items():
         counts = sum((Counter(row.infeasible_by_reason) for row in entry.replicas), Counter[str]())
@@ -308,8 +330,12 @@ def infeasible(summary: CampaignSummary) -> Table:
 
 
 def constraint_title(name: str, robots: Sequence[str]) -> str:
-    """Return a constraint's name for people: 'reach_1' becomes 'reach' with the name of the first
-    robot."""
+    """Return the name of a constraint for people.
+
+    Args:
+        name: name of the constraint; 'reach_1' becomes 'reach' with the name of the first robot.
+        robots: names of both robots.
+    """
     words = name.split("_")
     if words[-1].isdigit():
         return f"{' '.join(words[:-1])}, {robots[int(words[-1]) - 1]}"
@@ -317,8 +343,12 @@ def constraint_title(name: str, robots: Sequence[str]) -> str:
 
 
 def bounds(search: NormalisationBounds, drivable: NormalisationBounds | None = None) -> Table:
-    """Return the table of the bounds of the decision variables that members of the best fronts lie
-    on, of one experiment or of both."""
+    """Return the table of the bounds of decision variables on which points of the best fronts lie.
+
+    Args:
+        search: bounds of the first experiment.
+        drivable: bounds of a second, drivable experiment; None without one.
+    """
     rows = []
     for name, found in (("search", search), ("drivable", drivable)):
         if found is None:
@@ -362,8 +392,8 @@ def rank_tests(summary: CampaignSummary) -> Table:
 
 
 def time_against_force(found: StoredRecommendation) -> Table:
-    """Return the table of the shortest durations of some paths and of the front at the same
-    commanded forces."""
+    """Return the table of the shortest durations of several paths, and of the whole front, at the
+    same commanded forces."""
     table = found.durations
     return Table(
         "time_against_force",
@@ -377,8 +407,12 @@ def time_against_force(found: StoredRecommendation) -> Table:
 
 
 def robust_price(price: RobustPrice, robots: Sequence[str]) -> Table:
-    """Return the table of the recommended carry's peak normal forces that hold in multiples of the
-    uncertainty. `robots` are the names of both robots."""
+    """Return the table of the normal forces with which the recommended carry holds in multiples of
+    the uncertainty.
+
+    Args:
+        robots: names of both robots.
+    """
     check, of = price.check, "" if price.uncertainty.stated else ", the usual one"
     return Table(
         "robust_price",
@@ -396,7 +430,7 @@ def robust_price(price: RobustPrice, robots: Sequence[str]) -> Table:
 
 
 def simulated(found: Sequence[StoredSimulation]) -> Table:
-    """Return the table of the carries that were driven in the simulated cell."""
+    """Return the table of the results of carries in the simulated cell."""
 
     def holds(one: StoredSimulation) -> str:
         return f"{one.slips:.3f} to {one.holds:.3f}" if math.isfinite(one.holds) else one.problem
@@ -434,8 +468,13 @@ LabelledTimings = Sequence[tuple[str, TimingDocument]]
 
 
 def timings(timed: LabelledTimings, robots: Sequence[str]) -> Table:
-    """Return the table of durations and forces of trajectories, under the timing of the search and
-    under timings that robots can drive. `robots` are the names of both robots."""
+    """Return the table of durations and forces of trajectories, with the timing of the search and
+    with timings that robots can drive.
+
+    Args:
+        timed: label and timings of each trajectory.
+        robots: names of both robots.
+    """
     return Table(
         "timing",
         "What real timing makes of the selected trajectories.",
@@ -485,8 +524,12 @@ def _timing_cells(timing: StoredTiming) -> tuple[str, ...]:
 
 
 def margins(timed: LabelledTimings) -> Table:
-    """Return the table of how far assumptions of the model may be off before a carry fails, under
-    the timing that robots drive. At least one of the trajectories must have margins."""
+    """Return the table of how far single values of the model may be off before a carry fails, with
+    the timing that robots drive.
+
+    Args:
+        timed: label and timings of each trajectory, of which at least one has margins.
+    """
     judged = [(label, document.margins) for label, document in timed if document.margins]
     rows = []
     for found in zip(*(margins for _, margins in judged), strict=True):
