@@ -43,12 +43,12 @@ class CompiledFunction(NumericFunction):
     """A function in a shared library with the driver of `codegen.source`.
 
     Several threads may call it at once: each evaluation has its own work memory, and runs without
-    the interpreter's lock.
+    Python's global interpreter lock.
 
     Attributes:
         library: path of the shared library.
-        lanes: number of evaluations of a batch that run side by side; 1 if the library was built
-            without lanes, or if lanes give other bits than single evaluations.
+        lanes: number of evaluations of a batch that run side by side; 1 if the library has no
+            lanes, or if the results in lanes differ in any bit from single evaluations.
     """
 
     def __init__(self, signature: Signature, library: Path, loaded: ctypes.CDLL) -> None:
@@ -215,8 +215,9 @@ class _Driver:
     """One driver of a library, with work memory that calls reuse.
 
     Attributes:
-        function: evaluates candidates from begin to end, given the addresses of their arguments and
-            of work memory. It returns the index of the first evaluation that failed, or `_SUCCESS`.
+        function: C function with the arguments ports (address of the descriptions of arguments and
+            results), work (address of work memory), begin and end. It evaluates the candidates from
+            begin to end - 1, and returns the index of the first one that failed, or `_SUCCESS`.
         address: address of the function.
         idle: work memory that no thread uses at present.
     """

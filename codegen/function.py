@@ -317,14 +317,13 @@ class NumericFunction(ABC):
 
 @dataclass(frozen=True)
 class NativeCall:
-    """Addresses with which C evaluates a prepared batch. They are valid as long as the batch
-    exists.
+    """Addresses with which C evaluates a prepared batch, valid as long as the batch exists.
 
     Attributes:
-        one, lanes: addresses of `dual_arm_run` and `dual_arm_run_lanes` of `codegen/c`; the second
-            is 0 without lanes.
+        one, lanes: addresses of the C functions `dual_arm_run` and `dual_arm_run_lanes` of
+            `codegen/c`; `lanes` is 0 for a function without lanes.
         ports: address of the descriptions of arguments and results.
-        work, lane_work: addresses of the work memory of either function.
+        work, lane_work: addresses of the work memory of `dual_arm_run` and of `dual_arm_run_lanes`.
     """
 
     one: int

@@ -1,19 +1,18 @@
-"""C text in parts that are compiled separately, and long straight-line C in pieces.
+"""Long functions of a C text: compiled separately, and cut into pieces.
 
-Many texts contain the same functions: an arm's Newton steps are in everything that follows a path,
-and twice if both arms are of one kind. A part is a long function that calls no other (`straight` in
-the grammar of `codegen.lanes`, and functions of matrices that need no helper). It is put in a file
-of its own, named by its content, so texts with the same part share one object file. Parts of one
-text are compiled side by side; parts for lanes have their own optimisation level.
+Many texts contain the same functions: an arm's Newton steps are in every function that follows a
+path, and twice if both arms are of one kind. A part is a long function that calls no other
+(`straight` in the grammar of `codegen.lanes`, and functions of matrices that need no helper). Each
+part has a file of its own, named by its content, so texts with the same part share one object file.
+The parts of one text are compiled in parallel. Parts for lanes have their own optimisation level.
 
-CasADi writes a function of scalars as one line of statements over as many local variables as are
-live at once. The compile time of such a text grows faster than its length, because every variable
-may conflict with every other. So it is cut into pieces: functions of some hundred statements that
-pass live variables to the next piece through an array. The same statements run in the same order
-and give the same bits.
+CasADi writes a scalar function (type SX) as one sequence of statements over as many local
+variables as are in use at once. The compile time of such a text grows faster than its length,
+because every variable may conflict with every other. So the function is cut into pieces: functions
+of some hundred statements, which pass their variables to the next piece through an array. The same
+statements run in the same order and give the same bits.
 
-Text that does not match these patterns is neither taken out nor cut. It is compiled in its place,
-which only takes longer.
+Text with another form stays as it is and only takes longer to compile.
 """
 
 from __future__ import annotations
@@ -74,12 +73,12 @@ _VARIABLE = re.compile(r"\ba\d+\b")
 
 @dataclass(frozen=True)
 class CodePart:
-    """A function that is compiled in a file of its own.
+    """A long function that is compiled in a file of its own.
 
     Attributes:
         name: name of the function, made from the content of the file.
         text: content of the file.
-        level: optimisation level.
+        level: optimisation level of the compiler, 0 to 3.
     """
 
     name: str

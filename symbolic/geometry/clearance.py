@@ -60,19 +60,23 @@ def screening_functions(
 ) -> dict[str, ca.Function]:
     """Build the functions that collision checking calls, by name.
 
-    The first two take pose (6,), q_1 and q_2 (n,) [m, rad] of one sample. clearance: -> clearance
-    (n_near,), lower bounds of the distances of the possible pairs that are near [m], in order.
-    far_clearance: the same bounds for the other possible pairs, if any [m]. piece_poses: ->
-    quaternions (4, n_pieces) as w x y z, positions (3, n_pieces) [m]: every piece of every body in
-    the world, in the bodies' order. motion, far_motion: the functions of `motion_function` for near
-    and other pairs.
+    clearance: pose (6,), q_1 and q_2 (n,) of one sample [m, rad] -> lower bounds (n_near,) [m] of
+    the distances of the near possible pairs (`CellGeometry.near`), in order.
+
+    far_clearance: the same inputs -> bounds of the other possible pairs [m]; only if there are
+    any.
+
+    piece_poses: the same inputs -> quaternions (4, n_pieces) as w x y z, and positions (3,
+    n_pieces) [m], of every piece of every body in the world, in the order of the bodies.
+
+    motion, far_motion: the functions of `motion_function` for near and other pairs.
 
     Args:
         geometry: bodies and pairs of the cell.
+        joint_placements: the function `RobotModel.joint_placements` of each robot.
         softness: `EXACT` for screening; `Softness(width)` for smooth bounds that are lower by a few
             widths [m].
-        joint_placements: the function `RobotModel.joint_placements` of each robot.
-        screen: screen of the geometry, with numbers or symbols; None to compute the screen here.
+        screen: numbers of the bodies, as arrays or symbols; None to compute them here.
     """
     screen = screen_of(geometry) if screen is None else screen
     pose = ca.SX.sym("pose", 6)
@@ -153,9 +157,9 @@ class DistanceBounds:
         """Store the placements; expressions are built on demand.
 
         Args:
-            screen: bodies and pairs of the cell.
-            R_box, p_box: (3, 3) rotation and (3,) position of the box in the world.
-            placements: for each robot the rotations (3, 3 n) and positions (3, n) of the joint
+            screen: numbers of the bodies and pairs of the cell.
+            R_box, p_box: (3, 3) rotation and (3,) position [m] of the box in the world.
+            placements: for each robot the rotations (3, 3 n) and positions (3, n) [m] of the joint
                 frames in the root, side by side, from `RobotModel.joint_placements`.
             softness: `EXACT`, or the width of smooth bounds.
         """

@@ -1,11 +1,11 @@
-"""Triangle meshes as convex pieces whose union contains them.
+"""Decomposition of triangle meshes into convex hulls whose union contains the mesh.
 
-A watertight component is cut by planes where that makes the hulls of its parts markedly
-smaller. The hull of a part contains the part's surface and, with the cut's outline, the cap
-that closes it: so the union of the hulls contains the solid. A component with holes has no
-inside; its whole hull is used, with a warning where a mesh without holes may be cut. CoACD and
-V-HACD remesh or voxelise first and promise no containment. The hulls are then simplified:
-`simplify` joins and thins them outwards.
+A watertight component is cut by planes if that makes the hulls of its parts markedly smaller. The
+hull of a part contains the part's surface and the outline of the cut, hence also the cap that
+closes the part. So the union of the hulls contains the solid. A component with holes has no inside,
+so the hull of the whole component is used; a warning follows if closing the holes might give
+smaller hulls. Finally `simplify` joins hulls and removes corners, always outwards. CoACD and V-HACD
+are not used: they remesh or voxelise first, and promise no containment.
 """
 
 from __future__ import annotations

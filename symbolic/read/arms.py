@@ -1,13 +1,13 @@
 """Arms in robot descriptions: chains of joints, Pinocchio models, and the links that belong to each
 arm.
 
-A serial arm of six joints or more is picked from a description (`symbolic.read.urdf`); every other
-joint is held.
+A serial arm of six joints or more is picked from a description (`symbolic.read.urdf`); every
+other joint is held.
 
 Two robots of a workcell with the same description at the same place are the two arms of one
-machine. Every link is then modelled once. Behind an arm's first moving joint it belongs to this
-arm. A link that a common joint (a lift, a torso) moves belongs to the first arm. A link that
-neither arm moves is fixed for both.
+machine. Every link is then modelled once. A link that one arm's joints move belongs to this arm. A
+link that only a common joint (a lift, a torso) moves belongs to the first arm. A link that neither
+arm moves is fixed for both.
 
 A description without such an arm raises a `RobotModelError`.
 """
@@ -270,11 +270,12 @@ def moving_joints(urdf: Urdf, chain_root: str, flange: str, locked: Positions) -
 
 
 def arm_model(robot: Robot) -> pin.Model:
-    """Return a robot's Pinocchio model: its chain of moving joints, with all other joints held and
-    the tool's mass included.
+    """Return the Pinocchio model of a robot's chain of moving joints.
+
+    All other joints are held, and the mass of the tool is included.
 
     Raises:
-        RobotModelError: the robot is not a serial arm with its flange.
+        RobotModelError: the robot is not a serial arm that ends in its flange.
     """
     urdf = robot_urdf(robot)
     moving = moving_joints(urdf, robot.chain_root, robot.flange, robot.locked_joints)
@@ -380,11 +381,11 @@ class ArmLinks:
     """Links with collision shapes that are modelled with one arm, in the order of the file.
 
     Attributes:
-        moved: links behind the arm's first moving joint. Links that only common joints move are
-            listed with the first arm alone.
+        moved: links behind the arm's first moving joint. Links that only common joints of both arms
+            move are listed with the first arm alone.
         still: links that do not move, listed with one arm only.
-        mount: last link with shapes before the links of `moved` on the way to the flange. It is
-            fixed, or, for the second arm, moved by common joints; '' if there is none.
+        mount: last link with shapes before the links of `moved` on the way to the flange, '' if
+            there is none. It is fixed, or, for the second arm, moved by common joints.
     """
 
     moved: tuple[str, ...]
@@ -393,8 +394,10 @@ class ArmLinks:
 
 
 def one_machine(robots: Arms) -> bool:
-    """Return True if two robots are arms of one machine: chains of one description at one base
-    pose."""
+    """Return True if two robots are arms of one machine.
+
+    Their chains are in one description, at one base pose.
+    """
     first, second = robots
     return (
         bool(first.chain_root and second.chain_root)
@@ -486,7 +489,12 @@ def _carriers(robot: Robot) -> dict[str, str]:
 
 
 def _mount(robot: Robot, still: Collection[str]) -> str:
-    """Return the last link with shapes on the way from the root to the arm's first own joint."""
+    """Return the link with shapes that an arm is mounted on; '' if there is none.
+
+    Args:
+        robot: the arm.
+        still: links that the arm's own joints do not move.
+    """
     urdf = robot_urdf(robot)
     way = (robot.flange, *(urdf.joints[name].parent for name in urdf.above(robot.flange)))
     return next((link for link in way if link in still), "")

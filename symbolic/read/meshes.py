@@ -133,7 +133,10 @@ def _read(path: Path) -> trimesh.Trimesh:
 
 
 def _is_text(kind: str, content: bytes) -> bool:
-    """Return True if a mesh is parsed word by word. Of an STL text only the numbers are parsed."""
+    """Return True if a mesh file is parsed word by word.
+
+    An STL text is not, since only its numbers are parsed.
+    """
     second = content[:1000].split(b"\n", 2)[1:2]
     return kind in ("obj", "off") or (kind == "ply" and b"binary" not in b"".join(second).lower())
 

@@ -1,14 +1,14 @@
-"""Conversion of nested values of TOML, YAML and JSON to records; annotations of a record's fields
-state the allowed values.
+"""Conversion of nested values of TOML, YAML and JSON to checked records.
 
-`checked` supports `bool`, `int`, `float`, `str`, `Literal`, enumerations, `tuple`, `Mapping[str,
-...]`, `... | None`, dataclasses, `Any` for values that are only passed on, and `Annotated` with the
-marks of `symbolic.array`. Values that a record's `__post_init__` refuses are wrong too. (msgspec is
-not used: it supports neither numbers that may be missing nor shapes of arrays.)
+The annotations of a record's fields state the allowed values. `checked` supports `bool`, `int`,
+`float`, `str`, `Literal`, enumerations, `tuple`, `Mapping[str, ...]`, `... | None`, dataclasses,
+`Any` for values that are only passed on, and `Annotated` with the marks of `symbolic.array`. Values
+that a record's `__post_init__` refuses are wrong too. (msgspec is not used: it supports neither
+numbers that may be missing nor shapes of arrays.)
 
 All problems are collected; reading does not stop at the first. A wrong value is recorded, and a
 harmless placeholder of its kind takes its place. Placeholders never escape: the caller raises an
-error if `Problems.found` is not empty. `FirstProblem` stops at once.
+error if `Problems.found` is not empty. `FirstProblem` raises at the first problem.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""An arm as expressions.
+"""Kinematics and dynamics of an arm as CasADi expressions.
 
 model: Pinocchio's kinematics and dynamics as CasADi functions, through the compiled bridge. arm:
-Newton's method along a path. branches: start postures.
+inverse kinematics along a path by Newton's method. branches: start postures.
 """

@@ -1,13 +1,13 @@
 """Pinocchio's algorithms as CasADi functions, through this project's own C++ extension.
 
-The extension `_pinocchio_casadi` instantiates Pinocchio's algorithms over `casadi::SX`. It is
-used even where a `pinocchio.casadi` module exists, so that a robot gives the same expressions on
-every machine. Model and function cross the language border as text (`pinocchio.Model` and
-`casadi.Function` both serialise), so neither side depends on the other's Python bindings.
+The extension `_pinocchio_casadi` instantiates Pinocchio's algorithms over `casadi::SX`. It is used
+even where a `pinocchio.casadi` module exists, so that a robot gives the same expressions on every
+machine. Model and function pass between Python and C++ as text (`pinocchio.Model` and
+`casadi.Function` both serialise), so the extension needs no Python bindings of either library.
 
-Every function here takes a numeric `pinocchio.Model` and returns a `casadi.Function` over SX with
-dense outputs, which may be called on SX, MX and DM. nq and nv are the model's configuration and
-tangent dimensions. Frames: "root" is the model's universe frame, the URDF's root link.
+Every function here takes a numeric `pinocchio.Model` and returns a `casadi.Function` over SX
+with dense outputs, which may be called on SX, MX and DM. nq and nv are the model's numbers of joint
+positions and velocities. Frames: "root" is the model's universe frame, the URDF's root link.
 
 Raises:
     BridgeError: the extension is missing, cannot be loaded, or was built for other versions.
