@@ -69,7 +69,8 @@ class RankTest:
         p_holm: p-value after Holm's correction over a family of tests; `p` for a single test.
         a12: Vargha and Delaney's effect size, the chance that a value of the first sample
             exceeds one of the second, ties counting half; 0.5 is no effect.
-        magnitude: word for |a12 - 0.5|: small from 0.06, medium from 0.14, large from 0.21.
+        magnitude: word for the distance of `a12` from 0.5: small from 0.06, medium from 0.14,
+            large from 0.21.
         figure: name of the compared figure, '' if stated elsewhere.
     """
 

@@ -44,8 +44,8 @@ def violation_of(objectives: Array, constraints: Array) -> Array:
         constraints: (n, n_con) constraint values, satisfied where <= 0; n_con may be 0.
 
     Returns:
-        (n,) sum of the positive constraint values, 0 if feasible; infinite if any objective or
-        constraint is NaN, infinite or at least `WORST_OBJECTIVE`.
+        (n,) sum of the positive constraint values, 0 if feasible. It is infinite if any objective
+        is NaN or reaches `WORST_OBJECTIVE` in magnitude, or if any constraint is not finite.
     """
     total = np.maximum(constraints, 0.0).sum(axis=1)
     sound = (np.abs(objectives) < WORST_OBJECTIVE).all(axis=1) & np.isfinite(constraints).all(
@@ -55,7 +55,8 @@ def violation_of(objectives: Array, constraints: Array) -> Array:
 
 
 def feasible_front(points: Population) -> Population:
-    """Return the feasible, mutually non-dominated members of a population, without duplicates."""
+    """Return the feasible members of a population that no other feasible member dominates, without
+    duplicates."""
     if len(points) == 0:
         return points
     feasible = points[points.get("CV")[:, 0] == 0.0]
@@ -164,7 +165,14 @@ class ExhaustiveMating(Mating):  # type: ignore[misc]
     """
 
     def do(self, problem: Problem, pop: Population, n_offsprings: int, **kwargs: Any) -> Population:
-        """Return exactly `n_offsprings` offspring of the population `pop`."""
+        """Return exactly `n_offsprings` offspring.
+
+        Args:
+            problem: the problem, whose bounds limit the offspring.
+            pop: population of the parents.
+            n_offsprings: number of offspring.
+            kwargs: passed on to pymoo.
+        """
         offspring = super().do(problem, pop, n_offsprings, **kwargs)
         missing = n_offsprings - len(offspring)
         if missing > 0:

@@ -33,23 +33,26 @@ Stretch = tuple[slice, int]
 
 @dataclass(frozen=True)
 class PlacedCarry:
-    """A candidate evaluated at m places along the path.
+    """A candidate evaluated at m places along the path, and at the task's n samples.
 
     Attributes:
-        waypoints: (n_waypoints, 6 + m) extended waypoints [m, rad].
-        pose, rate: (m, 6) box poses [m, rad] and their first derivative by the path parameter.
-        q: (m, n) joint positions of each arm [rad]; undefined from place `reached` on.
+        waypoints: (n_waypoints, 6 + k) extended waypoints of a task with k redundant joints [m,
+            rad].
+        pose, rate: (m, 6) box poses [m, rad] and their first derivatives by the path parameter.
+        q: (m, joints) joint positions of each arm [rad]; undefined from place `reached` on.
         reached: number of places before the first one out of an arm's reach.
         unreachable_arms: indices of the arms that do not reach all places.
-        manipulability: (reached, 2) |det J| over its least allowed value.
-        split: (n, 2) at samples: for soft fingers both normal forces, else normal component and
-            tangential magnitude of the required force [N]; undefined in drivable cells and if the
-            pads do not face each other.
-        force: (n, 2) at samples: the normal forces that are minimised, planned or robust [N].
-        peak: (2,) largest of these forces over the reference forces.
-        shift: (n, 2) at samples: shifts of the centres of pressure over the patch radii.
+        manipulability: (reached, 2) absolute determinant of each arm's Jacobian over its least
+            allowed value.
+        split: (n, 2) both force quantities [N] of which the normal forces are branches: for soft
+            fingers both normal forces, else normal component and tangential magnitude of the
+            required force. Undefined in drivable cells and if the pads do not face each other.
+        force: (n, 2) normal forces that are minimised, planned or robust [N].
+        peak: (2,) largest of these forces of each robot over its reference force.
+        shift: (n, 2) shifts of the centres of pressure over the patch radii.
         distances: distances of all active pairs at the places within reach.
-        gaps: function from a separable pair to its gaps (reached, SEPARATING_DIRECTIONS) [m].
+        gaps: function from the index of a separable pair to its gaps (reached,
+            SEPARATING_DIRECTIONS) [m].
     """
 
     waypoints: Array
@@ -141,10 +144,10 @@ class Distances:
 
         Args:
             bounds: (n, n_pairs) lower bounds of the distances [m].
-            measure: function that raises bounds in place to measured distances, see
-                `CollisionChecker.measure`.
-            configuration: arrays (n, ...) that describe the n places, the first arguments of
-                `measure`.
+            measure: `CollisionChecker.measure`, which raises chosen bounds to measured distances in
+                place.
+            configuration: first arguments of `measure`: box poses and joint positions of both arms
+                at the n places.
         """
         near = bounds.min(axis=0, initial=np.inf) < MINIMA_BELOW
         self.bounds, self.interpolated_clearance = bounds, bounds.copy()

@@ -425,8 +425,8 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         return program.residuals(bounds, found.linear, answer.rows)
 
     def solve_from(self, x: Array) -> TrustRegionSolve[DriveIterate, DriveStep]:
-        """Return a solve that starts from a decision vector (n_var,), before its first
-        iteration."""
+        """Prepare a solve that starts from a decision vector x (n_var,); it makes no
+        iteration yet."""
         return TrustRegionSolve(self, x, FIRST_DRIVE_RADIUS)
 
 

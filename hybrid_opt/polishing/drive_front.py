@@ -185,7 +185,13 @@ class DriveRun(PolishRun[DriveAttempt]):
         yield from self._gaps()
 
     def _attempt(self, path: Array, force: float, moves: Literal["stated", "all"]) -> DriveAttempt:
-        """Return the attempt that starts from a path (n_path,) at a force limit [N]."""
+        """Return the attempt that starts from a path.
+
+        Args:
+            path: (n_path,) free waypoints.
+            force: force limit [N].
+            moves: which waypoints the solve moves, see `DriveAttempt`.
+        """
         x = np.append(path, force)
         return DriveAttempt("gap", -1, x, self._evaluator.evaluate(x).objectives[0], moves)
 

@@ -230,7 +230,7 @@ class ForceGap:
 
 
 def gaps(archive: ParetoArchive) -> list[ForceGap]:
-    """Return all gaps of a front, sorted by the first objective."""
+    """Return the gaps between neighbouring points of a front, sorted by the first objective."""
     rows = archive.front_indices()
     scaled = np.array([archive.objectives[k] for k in rows]) / archive.span()
     sides = np.abs(np.diff(scaled, axis=0))
@@ -583,7 +583,8 @@ class ForceRun(PolishRun[ForceAttempt]):
     def _ends(
         self, objectives: tuple[int | None, ...], rng: np.random.Generator
     ) -> Iterator[ForceAttempt]:
-        """Yield one attempt per objective, and count attempts without progress."""
+        """Yield one attempt for each given objective (None for the balanced middle), and count the
+        attempts without progress."""
         perturb = partial(perturb_start, self._evaluator, rng=rng)
         for objective in objectives:
             before, stalls = self._archive.best(objective)[1], self._stalls[objective]

@@ -76,7 +76,7 @@ class ParetoArchive:
         self.polished.append(True)
 
     def drop(self, indices: Sequence[int]) -> None:
-        """Remove points; indices of the others change."""
+        """Remove the points with these indices; later points get smaller indices."""
         lists: tuple[list[Any], ...] = (self.x, self.objectives, self.parent, self.polished)
         for values in lists:
             values[:] = [value for k, value in enumerate(values) if k not in indices]
@@ -98,7 +98,8 @@ class ParetoArchive:
         return index, values[index]
 
     def span(self) -> Array:
-        """Return the range (2,) of each objective over the front, at least `LEAST_SPAN`."""
+        """Return the range (2,) of each objective over the front, or `LEAST_SPAN` where it is
+        smaller."""
         values = np.array(self.objectives)[self.front_indices()]
         return np.asarray(np.maximum(np.ptp(values, axis=0), LEAST_SPAN))
 

@@ -171,11 +171,11 @@ class Step:
 
     Attributes:
         length: largest change of a scaled variable.
-        required: rows of the program with the value that each has to exceed.
-        residuals: function from an iterate to its optimality residuals.
+        required: value that each row of the program had to exceed.
+        residuals: function from an iterate to its optimality residuals in this program.
         iterations: number of solver iterations.
         is_stationary: True if the iterate from which the step starts is stationary.
-        converged: True if the program was solved to optimality, as the solver reports.
+        converged: True if the solver reports that it solved the program to optimality.
         active_rows: rows at places of the path with a nonzero multiplier.
     """
 

@@ -133,7 +133,10 @@ class PolishedFront:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Count attempts by status; attempts not accepted also by 'status: reason'."""
+        """Count the attempts by status.
+
+        Attempts that were not accepted are also counted by 'status: reason'.
+        """
         listed = Counter[str](outcome.status for outcome in self.outcomes)
         listed.update(f"{o.status}: {o.reason}" for o in self.outcomes if o.reason)
         return dict(listed)

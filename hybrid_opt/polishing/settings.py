@@ -115,12 +115,20 @@ class PolishSettings:
 
 
 def default_settings(is_drivable: bool) -> PolishSettings:
-    """Return the settings of a full study, of a drivable cell or of another cell."""
+    """Return the settings of a full study.
+
+    Args:
+        is_drivable: True for a drivable cell.
+    """
     return PolishSettings(attempts=DRIVABLE_ATTEMPTS) if is_drivable else PolishSettings()
 
 
 def quick_settings(is_drivable: bool) -> PolishSettings:
-    """Return the settings of a small study: a third as many points from fewer attempts."""
+    """Return the settings of a small study: a third as many points from fewer attempts.
+
+    Args:
+        is_drivable: True for a drivable cell.
+    """
     if is_drivable:
         return PolishSettings(
             attempts=QUICK_DRIVABLE_ATTEMPTS, drivable=DrivableSettings(members=10)

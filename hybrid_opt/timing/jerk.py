@@ -100,6 +100,7 @@ def time_with_jerk(
     """Compute a fast timing from rest to rest within all limits, with continuous accelerations.
 
     Args:
+        model: timing model of the workcell.
         x: (n_var,) decision vector.
         limits: limits in addition to the workcell's.
         jerk: jerk limits of joints and payload.
@@ -174,8 +175,12 @@ class _JerkProblem:
         return c, rounds
 
     def _step(self, c: Array) -> Array | None:
-        """Return spline coefficients (k,) with a shorter duration than c (k,) that satisfy all
-        limits at the coarse points; None if the program has no solution."""
+        """Solve one program about coefficients c (k,).
+
+        Returns:
+            Coefficients (k,) with a shorter duration that satisfy all limits at the coarse points;
+            None if the program has no solution.
+        """
         at, rows = self._coarse, JerkProgram(len(c))
         self._motion_rows(rows)
         self._force_rows(c, rows)

@@ -461,13 +461,15 @@ class TimingModel:
         )
 
     def still(self, motion: PathMotion) -> Carry:
-        """Return the carry at rest at every sample of `motion`."""
+        """Return a carry that stands still at every sample of `motion`."""
         zero = np.zeros(len(motion.parameter))
         return self.carry(motion, zero, zero, zero)
 
     def drive_limits(self, force: float) -> TimingLimits:
-        """Return the limits of drivable carries with a force limit [N]; it bounds robust forces if
-        the model is robust."""
+        """Return the limits of drivable carries with a force limit `force` [N].
+
+        The force limit applies to robust forces if the model is robust, else to planned forces.
+        """
         return TimingLimits(force=force, robust=self.is_robust)
 
     def checked(self, x: Array) -> Array:
@@ -538,7 +540,10 @@ class SpeedProfile:
 
 
 def sample_limits_set(compiled: CompiledCell, lanes: int) -> NumericFunction:
-    """Load or build the compiled function `symbolic.limit_coefficients.sample_limits_function`."""
+    """Load or build the compiled function `symbolic.limit_coefficients.sample_limits_function`.
+
+    It evaluates `lanes` samples side by side; 0 is the machine's width.
+    """
 
     def make(model: CellModel) -> dict[str, ca.Function]:
         # Not imported at the top: a warm start needs no CasADi.
@@ -550,7 +555,7 @@ def sample_limits_set(compiled: CompiledCell, lanes: int) -> NumericFunction:
 
 
 def require_intervals(intervals: int) -> None:
-    """Check the number of intervals.
+    """Check that a number of intervals is allowed.
 
     Raises:
         SettingsError: the number is out of range.

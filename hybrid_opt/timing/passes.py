@@ -160,10 +160,13 @@ class ForwardBackwardPasses:
 
 
 class RobustCuttingPlanes:
-    """Fastest timings of n paths within robust force limits, by Kelley's cutting planes.
+    """Computes the fastest timings of n paths within robust force limits.
+
+    Robust forces are convex in (u'', u'^2). They are bounded by their tangents (supporting lines)
+    at former timings, and the paths timed again (Kelley's cutting planes).
 
     Attributes:
-        peak: (n, 2) largest robust forces of the last timing [N].
+        peak: (n, 2) largest robust forces of each path's last timing [N].
     """
 
     def __init__(
@@ -433,12 +436,14 @@ def limit_place(
     sample: int,
     parameter: float,
 ) -> Place:
-    """Return the place at which a limit is used most.
+    """Describe the place at which a limit is used most.
 
     Args:
+        workcell: the workcell.
         joint_names: names of the joints of each arm.
         constraint: name of the limit.
-        column: column of `CarryLimits.ratios` of this limit: a joint, a robot, or 0.
+        column: index of the joint (both arms in order) or of the robot; 0 for a limit of the
+            payload.
         sample: index of the sample.
         parameter: path parameter u in [0, 1].
     """
@@ -453,7 +458,13 @@ def limit_place(
 
 
 def failed_timing(status: TimingStatus, place: Place, intervals: int) -> PathTiming:
-    """Return the `PathTiming` of a path that cannot be timed."""
+    """Return the record of a path that cannot be timed, with infinite duration and zero speeds.
+
+    Args:
+        status: why there is no timing.
+        place: the violated limit or condition, and where.
+        intervals: number of intervals of constant path acceleration.
+    """
     speed = np.zeros(intervals + 1)
     return PathTiming(status, place, float("inf"), np.full(2, np.nan), {}, speed)
 

@@ -43,8 +43,9 @@ PATH_INTERVALS = 100
 
 
 class PathTimer:
-    """Timer for the paths of one workcell. Limits that the compiled passes do not support are left
-    to `time_path`, which is slow.
+    """Computes the fastest timings of paths of one workcell.
+
+    Limits that the compiled passes do not support are left to `time_path`, which is slow.
 
     Attributes:
         workcell: the workcell.
@@ -234,7 +235,7 @@ class TimedCandidate:
 
 
 class CandidateDriver:
-    """Timer for the candidates of one drivable workcell.
+    """Computes the fastest timings of the candidates of one drivable workcell.
 
     Attributes:
         timer: times the paths of the candidates.

@@ -243,7 +243,9 @@ DIFFERENCE_STEP = 1e-6
 
 
 class TimingSensitivity:
-    """Linear program of timings near the fastest timing of a path.
+    """Linear program of the timings near the fastest timing of a path.
+
+    It tells how the shortest duration changes with parameters of the workcell.
 
     Attributes:
         speeds: path speeds of the fastest timing.

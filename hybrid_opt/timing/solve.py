@@ -74,10 +74,9 @@ def time_path(
 
 
 def _error_at_rest(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> Timing | None:
-    """Return an error if a limit is exceeded at rest, else None.
+    """Return the error of a path on which the box at rest exceeds a limit somewhere, else None.
 
-    If no limit is exceeded at rest a timing exists: in a slow motion every quantity is close to its
-    value at rest.
+    Without an error a timing exists: in a slow motion every quantity is close to its value at rest.
     """
     timing = check_limits(model, model.still(motion), limits)
     used = most_used(timing.use)
@@ -118,14 +117,20 @@ def time_by_programs(model: TimingModel, motion: PathMotion, limits: TimingLimit
     """Compute the fastest timing of a path by TOPP-RA's linear programs, checked on the finer grid.
 
     Args:
+        model: timing model of the workcell.
         motion: geometry of a path that both arms follow and on which no limit is exceeded at rest.
+        limits: limits in addition to the workcell's.
     """
     found = _run_programs(model, motion, limits)
     return found if isinstance(found, Timing) else _slow_down(model, motion, limits, found)
 
 
 def validate_timing(model: TimingModel, timing: Timing) -> Validation:
-    """Time the path of a timing of `time_path` again by TOPP-RA, within the same limits.
+    """Time the path of a timing again by TOPP-RA within the same limits, and compare the durations.
+
+    Args:
+        model: timing model of the workcell.
+        timing: result of `time_path`.
 
     Raises:
         SettingsError: there is no timing.

@@ -86,7 +86,7 @@ def toppra_timing(
 
 
 class _CuttingPlaneProblem:
-    """The sequence of linear problems for one path and one set of limits.
+    """The sequence of linear programs for one path and one set of limits.
 
     `_tightened` (intervals,) divides the bounds of each interval; it is above one if a limit was
     exceeded between the points of the interval. `_near` marks the limits that are not convex and
@@ -134,7 +134,7 @@ class _CuttingPlaneProblem:
             yield tangent_rows(*force, _pairs(still, still))
 
     def solve(self) -> PathTiming | Timing:
-        """Solve linear problems until the recomputed limits are satisfied and the duration
+        """Solve linear programs until the recomputed limits are satisfied and the duration
         settles."""
         squared = np.zeros(0)
         settled = False
@@ -188,8 +188,10 @@ class _CuttingPlaneProblem:
         return a / self._scale, w.reshape(-1) / self._scale**2
 
     def _advance(self, squared: Array) -> bool:
-        """Prepare the next linear problem: cut off a timing that exceeds convex limits, and
-        linearise the other limits about it.
+        """Add rows to the next linear program, after a timing by the last one.
+
+        Supporting lines cut off a timing that exceeds convex limits. The other limits are
+        linearised about the timing.
 
         Args:
             squared: (intervals + 1,) squared speeds of the timing in the scaled path coordinate.
@@ -219,10 +221,10 @@ class _CuttingPlaneProblem:
         return excess <= POINT_TOLERANCE and change <= SETTLED_CHANGE
 
     def _cut(self, a: Array, w: Array) -> float:
-        """Add supporting lines, tangent at a timing, of the convex limits that this timing exceeds.
+        """Add supporting lines of the convex limits that a timing exceeds, tangent at this timing.
 
         Args:
-            a, w: (points,) u'' [1/s^2] and u'^2 [1/s^2] of the timing.
+            a, w: (points,) path acceleration u'' and squared path speed u'^2 of the timing [1/s^2].
 
         Returns:
             The largest excess over a convex limit, as a share of the limit; negative if none is

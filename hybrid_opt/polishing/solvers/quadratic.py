@@ -75,7 +75,7 @@ class BorderedMatrix:
         )
 
     def add_diagonal(self, by: Array) -> BorderedMatrix:
-        """Return the matrix with a vector (k + n,) added to its diagonal."""
+        """Return this matrix with the vector `by` (k + n,) added to its diagonal."""
         k = len(self.corner)
         corner = self.corner.copy()
         corner[np.diag_indices(k)] += by[:k]
