@@ -130,7 +130,7 @@ def _waypoints(task: Task, x: ca.MX, handed: dict[str, ca.MX]) -> ca.MX:
 def _constraints(
     workcell: Workcell, values: dict[str, ca.MX], n: int, handed: dict[str, ca.MX]
 ) -> ca.MX:
-    """Map `_constraint_function` over n samples."""
+    """Build the constraint values (9, n) of n samples from the samples' quantities by name."""
     numbers = tile(select_parameters(handed, *workcell.robots, workcell.payload), n)
     inputs = [values[name] for name in _CONSTRAINT_INPUTS]
     return _constraint_function(workcell).map(n)(*inputs, *numbers)
@@ -355,7 +355,8 @@ _CONSTRAINT_INPUTS = (
 
 
 def _constraint_function(workcell: Workcell) -> ca.Function:
-    """Build the function of constraint values (9,) of one sample from the named outputs."""
+    """Build the function from the quantities `_CONSTRAINT_INPUTS` of one sample to the constraint
+    values (9,) in the order of `CONSTRAINTS`."""
     sizes = {"normal_force": 2, "tangential_force": 2, "pressure_shift": 2}
     inputs = {name: ca.SX.sym(name, sizes.get(name, 1)) for name in _CONSTRAINT_INPUTS}
     given = sx_parameters(*workcell.robots, workcell.payload)
@@ -388,8 +389,8 @@ def _row_max(matrix: ca.MX) -> ca.MX:
 
 
 def _time_share(time: ca.MX) -> ca.MX:
-    """Compute the share (1, n) of the duration that each sample represents: half of both
-    neighbouring steps."""
+    """Compute the share (1, n) of the duration that each sample represents: half the steps before
+    and after it. `time` are the n times [s]."""
     steps = time[:, 1:] - time[:, :-1]
     return (ca.horzcat(0.0, steps) + ca.horzcat(steps, 0.0)) / (2.0 * time[-1])
 

@@ -155,13 +155,13 @@ def limit_numbers(workcell: Workcell) -> dict[str, ca.SX]:
 
 
 def _contact_load(workcell: Workcell, blocks: dict[str, ca.SX], a: ca.SX, w: ca.SX) -> ContactLoad:
-    """Return the load of the contacts at one sample, along the axes of contact 1.
+    """Return the load on the contacts at one sample, along the axes of contact 1.
 
     Args:
         workcell: the cell.
         blocks: the blocks force and moment of `limit_layout`.
-        a: second derivative u'' of the path parameter.
-        w: square u'^2 of its first derivative.
+        a: second time derivative u'' of the path parameter.
+        w: square u'^2 of its first time derivative.
     """
     by = [blocks["force"][3 * k : 3 * k + 3] for k in range(3)]
     axes, centre = workcell.contacts[0].T_box_pad[:3, :3], workcell.payload.centre_of_mass
@@ -214,9 +214,12 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
 
 
 def _load_function(workcell: Workcell) -> ca.Function:
-    """Return the function from the blocks force and moment of `limit_layout`, u'' and u'^2 to the
-    load (6,) about the box frame's origin, along the box's axes [N, N m], and its derivatives (6,
-    2) by u'' and u'^2."""
+    """Build the function of the load (6,) about the box frame's origin, along the box's axes [N, N
+    m], and of its derivatives (6, 2) by u'' and u'^2.
+
+    Inputs: the blocks force and moment of `limit_layout` (15,), u'', u'^2, and the payload's
+    parameters.
+    """
     size = limit_layout(workcell).sizes["force"]
     payload = workcell.payload
     axes, centre = number(workcell.contacts[0].T_box_pad[:3, :3]), number(payload.centre_of_mass)
@@ -330,7 +333,7 @@ def contact_limits(
 
 
 def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
-    """Return the two functions of `ratio_functions` for a cell in which an optimisation computes
+    """Build the two functions of `ratio_functions` for a cell in which a convex program computes
     the forces."""
     layout = limit_layout(workcell)
     sizes, joints = layout.sizes, layout.joints
@@ -368,7 +371,8 @@ def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
 
 
 def _inputs(workcell: Workcell, blocks: dict[str, ca.SX]) -> dict[str, ca.SX]:
-    """Return the inputs of the function `limit_forces` by name, from the blocks of a sample."""
+    """Return the inputs of the function `limit_forces` by name; `blocks` are the symbols of one
+    sample's blocks."""
     timing = {name: ca.SX.sym(name) for name in ("a", "w")}
     return {"sample": ca.vertcat(*blocks.values())} | timing | sx_parameters(workcell.payload)
 
@@ -376,8 +380,8 @@ def _inputs(workcell: Workcell, blocks: dict[str, ca.SX]) -> dict[str, ca.SX]:
 def _slopes(
     name: str, value: ca.SX, inputs: dict[str, ca.SX], implicit: ImplicitVariables
 ) -> ca.Function:
-    """Return the function from inputs and solved variables to an expression and to its derivatives
-    by u'' and u'^2."""
+    """Build the function of an expression `value` and its derivatives by u'' and u'^2; its inputs
+    are `inputs`, then the solved variables of `implicit`."""
     value = ca.densify(value)
     by = {f"by_{z}": ca.densify(ca.jacobian(value, inputs[z])) for z in ("a", "w")}
     return named_function(name, inputs | {"solved": implicit.symbols}, {"value": value} | by)

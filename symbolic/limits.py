@@ -32,16 +32,17 @@ class Limit:
         name: name in messages, records and `hybrid_opt.timing.model.CarryLimits.ratios`.
         symbol: name of the limit in the compiled passes.
         unit: unit of the limited quantity.
-        expression: the limited ratio; its limit is 1.
-        group: group of limits that are tightened together.
-        scope: whether the limit has one value per joint, per robot or for the payload.
+        expression: text of the limited ratio; the ratio is at most 1.
+        group: 'motion' for limits on motion alone, 'force' for the convex normal forces, 'ratio'
+            for ratios of contact forces, which are not convex.
+        scope: 'joint', 'robot' or 'payload': one value per joint, per robot, or for the payload.
         block: name of a block in `limit_layout` and `symbolic.smooth.driven.driven_layout`.
-        option: field of `hybrid_opt.timing.records.TimingLimits` that switches the limit on, else
-            ''.
-        path: limited quantity of `symbolic.path_motion` (q, pose or angular), else ''. The limit
-            bounds its first derivative by u and, for accelerations, its second as well.
-        carry: name of the limited quantity in a carry, else ''.
-        bound: field of the robots or of the payload that states the largest value, else ''.
+        option: field of `hybrid_opt.timing.records.TimingLimits` that switches the limit on; '' if
+            it is always on.
+        path: limited quantity of `symbolic.path_motion` (q, pose or angular), '' for none. The
+            limit bounds its first derivative by u and, for accelerations, its second as well.
+        carry: name of the limited quantity in a carry, '' for none.
+        bound: field of the robots or of the payload that states the largest value, '' for none.
     """
 
     name: str

@@ -83,7 +83,8 @@ class LazyParameter:
 
 
 class _Collector:
-    """Collects the values of parameters and puts a `Parameter` in the place of each."""
+    """Collects the values of parameters and returns a `Parameter` for each, its placeholder in the
+    topology."""
 
     def __init__(self) -> None:
         self.entries: dict[str, list[tuple[Parameter, Array | LazyParameter]]] = {}
@@ -110,8 +111,8 @@ class _Collector:
 
 
 class _Symbols:
-    """Puts a slice of a group's vector of symbols in the place of each parameter, in the order in
-    which the values were collected."""
+    """Returns, for each parameter, its symbols: a slice of the vector of its group. Parameters must
+    come in the order in which `_Collector` took them."""
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
         self._groups = {
@@ -282,8 +283,8 @@ class CellParameters(WorkcellParameters):
 
 
 def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
-    """Replace the parameters in a cell's description by what `take` returns for them. Values that
-    no formula uses are set to constants."""
+    """Return a cell's description in which `take` has replaced all parameters. Values that no
+    formula uses become constants."""
     pairs = zip(cell.robots, cell.contacts, strict=True)
     first, second = (_robot(take, i, *pair) for i, pair in enumerate(pairs))
     payload: Any = replace(cell.payload, size=np.zeros(3), shape=None, jerk_max=None)
@@ -325,8 +326,15 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
 def _grasp(
     take: _Take, group: str, path: str, cell: Workcell, commanded: int | None
 ) -> GraspNumbers:
-    """Return the constants of a grasp as parameters that are computed on first use. `commanded` is
-    the index of the robot whose force is commanded, None for planned forces."""
+    """Return the constants of a grasp as parameters that are computed on first use.
+
+    Args:
+        take: replaces a parameter by a placeholder or a symbol.
+        group: name of the parameter group.
+        path: first part of the parameters' key paths.
+        cell: description of the cell.
+        commanded: index of the robot whose force is commanded; None for planned forces.
+    """
 
     @cache
     def found() -> GraspNumbers:
@@ -388,8 +396,8 @@ def _split(T: Array) -> tuple[Array, Array]:
 
 
 def _turn(take: _Take, group: str, path: str, rotation: Array) -> Any:
-    """Return the rotation of a base with its parameters replaced. For an upright base these are
-    cosine and sine of one angle, for a tilted base the whole matrix."""
+    """Return the rotation of a robot's base in which `take` has replaced the parameters: cosine and
+    sine of one angle for an upright base, the whole matrix (3, 3) for a tilted base."""
     level = np.array([0.0, 0.0, 1.0])
     if np.array_equal(rotation[2], level) and np.array_equal(rotation[:, 2], level):
         cosine, sine = rotation[0, 0], rotation[1, 0]
@@ -465,8 +473,8 @@ def _joint(take: _Take, joint: RedundantJoint) -> NumberedJoint:
 
 
 def _screen(take: _Take, screen: Screen) -> Screen:
-    """Replace the parameters of the distance bounds by what `take` returns for them. Shapes of
-    links and of meshes remain part of the topology."""
+    """Return the distance bounds in which `take` has replaced all parameters. Shapes of links and
+    of meshes remain part of the topology."""
     first, second = (_base(take, f"robots[{i}]", base) for i, base in enumerate(screen.bases))
     return replace(
         screen,
@@ -504,7 +512,7 @@ def _body(take: _Take, path: str, body: ScreenBody) -> Any:
 
 
 def _own(take: _Take, path: str, value: Any) -> Any:
-    """Replace every array of a record by what `take` returns for it, in the order of the fields."""
+    """Return a record in which `take` has replaced every array, in the order of the fields."""
     if isinstance(value, np.ndarray) and value.size:
         return take(BODIES, path, value)
     if isinstance(value, tuple):

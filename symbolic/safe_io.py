@@ -83,8 +83,8 @@ def read_bytes(
     Args:
         path: the file, or a symbolic link to it.
         most: largest accepted size [bytes].
-        judge: is called with the status of the opened file before it is read, and may raise an
-            error.
+        judge: function of the opened file's status, called before the file is read; it may raise an
+            error to refuse the file.
 
     Raises:
         OutsideError: the file cannot be read, is not a regular file, or is larger than `most`.
@@ -95,7 +95,8 @@ def read_bytes(
 
 
 def require(path: Path, most: int) -> None:
-    """Raise the error of `read_bytes` for a file that it would refuse, without reading the file.
+    """Check that `read_bytes` would accept a file of at most `most` bytes, without reading the
+    file.
 
     Raises:
         OutsideError: the file cannot be read, is not a regular file, or is larger than `most`.
@@ -105,7 +106,7 @@ def require(path: Path, most: int) -> None:
 
 
 def text(content: bytes) -> str:
-    """Decode UTF-8.
+    """Decode the bytes of a UTF-8 text.
 
     Raises:
         OutsideError: the content is not UTF-8.
@@ -120,7 +121,7 @@ def text(content: bytes) -> str:
 
 
 def xml_text(content: bytes) -> str:
-    """Decode an XML document, and drop a byte order mark.
+    """Decode the bytes of a UTF-8 XML document, without a byte order mark.
 
     Raises:
         OutsideError: the content is not UTF-8, declares another encoding, or has a document type,
@@ -375,5 +376,6 @@ def _is_still(draft: Path, file: BinaryIO) -> bool:
 
 
 def printable(text: str) -> str:
-    """Return a text of unknown origin in one line of printable characters."""
+    """Return a text of unknown origin as one line: characters that cannot be printed become spaces,
+    and runs of spaces one space."""
     return " ".join("".join(c if c.isprintable() else " " for c in text).split())

@@ -264,8 +264,10 @@ def centred(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Fu
 def _repeated(
     program: ConvexProgram, step: ca.Function, most: int, iterate: ca.MX, cell: list[ca.MX]
 ) -> ca.MX:
-    """Repeat a step, in whole blocks and at most `most` times, as long as its flag asks for
-    more."""
+    """Build the expression of an iterate after repeated steps.
+
+    The step is repeated in blocks of `BLOCK`, at most `most` times, until its flag is 0.
+    """
     held = [ca.MX.sym("iterate", iterate.shape[0]), ca.MX.sym("goes_on")]
     inputs = [*held, *_mx_inputs(program)]
     keep = ca.Function("keep", inputs, held)
@@ -283,8 +285,8 @@ def _repeated(
 
 @lru_cache(PROGRAMS)
 def _step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
-    """Build a step of the method: a function from iterate, an unused flag and the inputs to the
-    next iterate and a flag that asks for more."""
+    """Build the function of one step of the method: iterate, unused flag and inputs to the next
+    iterate, and a flag that is 1 if a further step is needed."""
     iterate, cell = ca.SX.sym("iterate", ends_of(program)[-1]), _sx_inputs(program)
     owns = zip(program.patches, ca.vertsplit(iterate, ends_of(program)), strict=True)
     local = [patch.local(own) for patch, own in owns]
@@ -380,15 +382,15 @@ def central_point(
 
 
 def _length(lowest: list[ca.SX], share: ca.SX | float) -> ca.SX:
-    """Compute the length of a step: at most one, and at most a share of the way to the cones'
-    boundary."""
+    """Compute the length of a step, at most 1, that goes at most the share `share` of the way to
+    the boundary of any cone; `lowest` has -1 / t of each patch (`Patch.lowest`)."""
     return ca.fmin(1.0, share / ca.fmax(-minimum(lowest), share))
 
 
 @lru_cache(PROGRAMS)
 def _start(program: ConvexProgram) -> ca.Function:
-    """Build the function from the inputs to the first iterate: the program's start, with
-    multipliers such that it lies on the central path of a similar problem."""
+    """Build the function from the program's inputs to the first iterate: the states of the
+    program's start, with multipliers as on the central path."""
     cell = _sx_inputs(program)
     states, share = program.start(cell)
     effort = program.effort(wrenches_of(program, states), cell)

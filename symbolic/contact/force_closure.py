@@ -160,8 +160,11 @@ def balance_maps(workcell: Workcell, in_units: bool = False) -> list[Array]:
 
 
 def _balanced_states(workcell: Workcell, share: float) -> tuple[Array, ...] | None:
-    """Find states within the cones, at a share of the friction, whose wrenches sum to zero; None if
-    there are none. They are sums of points on the cones' boundaries with positive weights."""
+    """Find one scaled state (4,) per pad that lies within the cone for `share` times the friction,
+    so that the wrenches of all pads sum to zero; None if there are none.
+
+    Each state is a sum, with positive weights, of points on the cone's boundary.
+    """
     maps = balance_maps(workcell)
     lessened = [_with_friction(_generators(pad), share) for pad in workcell.pads]
     columns = np.vstack([rows @ A.T for rows, A in zip(lessened, maps, strict=True)])
@@ -232,7 +235,8 @@ def scaled_patch(contact: Contact) -> SoftPatch:
 
 
 def _generators(contact: Contact) -> Array:
-    """Return states (n, 4) with N = 1 on the boundary of a patch's cone that span the cone."""
+    """Return n scaled states (n, 4) with N = 1 on the boundary of a patch's friction cone; their
+    positive sums approximate the cone."""
     patch, rows = scaled_patch(contact), []
     for angle in 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
         for share in np.linspace(0.0, 1.0, TORSIONS + 1)[:-1]:
@@ -265,8 +269,11 @@ def dependent_components(workcell: Workcell) -> tuple[int, ...]:
 
 
 def _new_columns(matrix: Array, order: Sequence[int], least: float) -> list[int]:
-    """Select columns of a matrix in a given order. A column is selected if its part outside the
-    span of the columns selected before is longer than `least`."""
+    """Select the indices of linearly independent columns of a matrix, in the order `order`.
+
+    A column is selected if its part outside the span of the selected columns is longer than
+    `least`.
+    """
     taken: list[int] = []
     span = np.zeros((len(matrix), 0))
     for k in order:
@@ -338,8 +345,8 @@ def grasp_shapes(workcell: Workcell) -> dict[str, Any]:
 
 
 def _shape(pad: Contact) -> Array:
-    """Return the mean distance and the spread of a rectangular patch over its radius; an empty
-    array for a disc."""
+    """Return three lengths (3,) of a rectangular patch over its radius, mean distance of its points
+    from the centre and both diagonal entries of `SoftPatch.spread`; an empty array for a disc."""
     if pad.half_sides is None:
         return np.zeros(0)
     patch = scaled_patch(pad)
@@ -394,8 +401,8 @@ def robot_wrenches(workcell: Workcell) -> Array:
 
 
 def _load_at_rest(workcell: Workcell) -> Array:
-    """Return the load (6,) of the payload at rest in its start pose, divided by the load's
-    scale."""
+    """Return force and moment (6,) about the box frame's origin, box axes, that hold the payload at
+    rest in its start pose, divided by the size of this load."""
     turn = box_rotation(workcell.task.orientation, workcell.task.waypoints[0].lower)
     force = -turn.T @ np.array(GRAVITY)
     moment = np.cross(workcell.payload.centre_of_mass, force)
@@ -404,5 +411,5 @@ def _load_at_rest(workcell: Workcell) -> Array:
 
 
 def _cleaned(matrix: Array) -> Array:
-    """Return a matrix with entries that are zero up to rounding set to zero."""
+    """Return a matrix with zeros in place of entries that differ from zero only by rounding."""
     return np.where(np.abs(matrix) < 1e-14 * np.abs(matrix).max(), 0.0, matrix)

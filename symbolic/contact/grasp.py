@@ -120,7 +120,8 @@ class Grasp:
         return self._balanced_wrenches(load, free, sizes)
 
     def _balanced_wrenches(self, load: ca.SX, free: ca.SX, sizes: list[ca.SX]) -> list[ca.SX]:
-        """Compute the wrenches of all pads that balance a load (6,), from their free components."""
+        """Compute the scaled wrenches (4,) of all pads that balance a load (6,), from their free
+        components `free` and the inputs `sizes` (friction, relative patch sizes)."""
         units = ca.vertcat(*[self.units(i, *sizes) for i in range(len(self.patches))])
         given = ca.mtimes(number(self.numbers.free_to_left), units[self._free.tolist()] * free)
         left = ca.mtimes(number(self.numbers.load_to_left), load) - given
@@ -131,8 +132,8 @@ class Grasp:
         return wrenches
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
-        """Compute half the sum of all squared pad forces, |f_i|^2 / 2, from scaled wrenches (4,)
-        and the inputs `cell`."""
+        """Compute half the sum of the squared magnitudes of all pad forces, from scaled wrenches
+        (4,) and the inputs `cell`."""
         friction, total = cell[1], 0.0
         for wrench, robot in zip(wrenches, self.robots, strict=True):
             total += wrench[0] ** 2 + friction[robot] ** 2 * ca.sumsqr(wrench[1:3])
@@ -174,16 +175,17 @@ class Grasp:
         return [c + press * s for c, s in zip(chosen, given, strict=True)], share
 
     def _squeeze_scale(self, given: list[ca.SX], asked: list[ca.SX]) -> ca.SX:
-        """Compute how much of the squeeze moves states into the cones."""
+        """Compute the factor on the internal squeeze `given` with which the states `asked` plus
+        squeeze lie within the cones."""
         shares = [p.lowest(s, a) for p, s, a in zip(self.patches, given, asked, strict=True)]
         return ca.fmax(-minimum(shares), 0.0) / START_SHARE + START_FLOOR
 
     @cached_property
     def _at_rest(self) -> tuple[ca.SX, ca.SX]:
-        """States of all patches, one after the other (n,), at the load at rest, and their
+        """States (n,) of all pads, one after the other, with the payload at rest, and their
         derivatives (n, 6) by the load.
 
-        These states balance the load and lie on the program's central path.
+        These states balance the load at rest and lie on the program's central path.
         """
         numbers = self.numbers if self.numbers.rest is not None else self.complete()
         return ca.SX(number(numbers.rest)), ca.SX(number(numbers.rest_slopes))
@@ -199,7 +201,7 @@ class Grasp:
         return replace(self.numbers, rest=rest, rest_slopes=slopes)
 
     def _nominal(self) -> tuple[list[float], ...]:
-        """Return the values that the workcell states for the inputs after the load."""
+        """Return the values of the inputs after the load in the workcell: friction (2,)."""
         return (np.array(ca.evalf(self.friction)).ravel().tolist(),)
 
     def least_states(self, load: ca.SX, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:

@@ -65,7 +65,8 @@ class GraspSqueeze(Grasp):
         self.cell_sizes = (*self.cell_sizes, ("reach", 2), ("displacement", 4))
 
     def _nominal(self) -> tuple[list[float], ...]:
-        """Return the values that the workcell states for the inputs after the load."""
+        """Return the values of the inputs after the load in the workcell: friction (2,), relative
+        patch sizes (2,) of 1, displacements (4,) of 0."""
         return (*super()._nominal(), [1.0, 1.0], [0.0] * 4)
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
@@ -81,7 +82,7 @@ class GraspSqueeze(Grasp):
         return wrenches
 
     def _turned(self, wrenches: list[ca.SX], displacement: ca.SX, sizes: list[ca.SX]) -> ca.SX:
-        """Compute the additional moment (3,) of scaled wrenches at displaced pads."""
+        """Compute the moment (3,) that the pads' forces gain by their displacement, box axes."""
         total = ca.SX.zeros(3)
         for i, (pad, robot, own) in enumerate(zip(self._pads, self.robots, wrenches, strict=True)):
             normal, *tangent = ca.vertsplit((self.units(i, *sizes) * own)[:3])

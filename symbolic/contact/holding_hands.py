@@ -351,8 +351,8 @@ class HoldingHands(ContactModel):
         return 0.0 * along, stiffness / 2.0 * np.hypot(along, across) * most
 
     def _opposed_need(self, friction: Expression) -> Expression:
-        """Return the largest additional holding force that one newton between the arms requires of
-        a hand."""
+        """Compute the largest additional holding force that any hand needs, per newton with which
+        the arms push against each other."""
         most = ca.SX(0.0)
         for i, own in zip(self.workcell.pad_robots, self.pad_parameters, strict=True):
             a, b, lifting = ca.vertsplit(ca.vec(number(own["opposed"])))

@@ -164,7 +164,8 @@ def _grasp_load_function(workcell: Workcell) -> ca.Function:
 
 
 def _named(inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
-    """Build `uncertain_load_function` from its inputs and outputs."""
+    """Build the function `uncertain_load` from inputs and outputs by name; its outputs are
+    `LOAD_OUTPUTS`."""
     ordered = {name: outputs[name] for name in LOAD_OUTPUTS}
     return named_function("uncertain_load", inputs, ordered, cse=False)
 
@@ -195,7 +196,8 @@ def required(
 
 
 def _sample_function(workcell: Workcell) -> ca.Function:
-    """Build the function from the inputs `SAMPLE_SIZES` to the outputs `GRASP_OUTPUTS`."""
+    """Build the function from the inputs `SAMPLE_SIZES` to the outputs `GRASP_OUTPUTS`, for pads
+    with any normals at one sample."""
     inputs, given = [ca.MX.sym(*entry) for entry in SAMPLE_SIZES], mx_parameters(workcell.payload)
     pose, force, moment, friction, centre_of_mass = inputs
     asked = (pose, force, moment, centre_of_mass)
@@ -206,8 +208,8 @@ def _sample_function(workcell: Workcell) -> ca.Function:
 
 
 def _length(vector: Expression) -> Expression:
-    """Compute a length that has a finite derivative at zero. The error, 1e-12 m, is far below any
-    patch."""
+    """Compute the length of a vector, with a finite derivative at zero. The error is at most 1e-12
+    in the vector's unit."""
     return ca.sqrt(ca.sumsqr(vector) + 1e-24)
 
 

@@ -86,8 +86,8 @@ def normal_force_branches(
 def allocate(
     force: Expression, normal: Expression, friction: tuple[float, float]
 ) -> tuple[Expression, Expression, Both]:
-    """Compute the contact forces of least effort, the minimum of |f_1|^2 + |f_2|^2, for a resultant
-    force.
+    """Compute the contact forces f_1 and f_2 of least effort, the least sum of their squared
+    magnitudes, for a resultant force.
 
     Args:
         force: (3,) resultant force on the box, world frame [N].

@@ -71,9 +71,9 @@ class SoftPatch:
 
     Attributes:
         twist: mean distance of the patch's points from its centre [m].
-        spread: (2, 2) matrix S [m]. For a unit vector t along the tangents of contact 1, |S t| is
-            twice the root mean square of the points' coordinates along t. For a disc S is the
-            radius times a rotation.
+        spread: (2, 2) matrix S [m]. For a unit vector t along the tangents of contact 1, the length
+            of S t is twice the root mean square of the points' coordinates along t. For a disc S is
+            the radius times a rotation.
     """
 
     twist: float | ca.SX
@@ -125,7 +125,7 @@ def torsion_capacity(
     derivative by the grip [m].
 
     Args:
-        grip: sqrt(mu^2 N^2 - |T|^2), the friction that the tangential force leaves [N].
+        grip: sqrt(mu^2 N^2 - T . T), the friction that the tangential force T leaves [N].
         tangent: (2,) tangential force T [N].
         patch: patch of the pad.
     """
@@ -135,8 +135,14 @@ def torsion_capacity(
 def _capacity(
     grip: Expression, squared: Expression, twist: Expression, half: Expression
 ) -> tuple[Expression, Expression]:
-    """Compute `torsion_capacity` from the grip, the squared tangential force [N^2], c and h / 2
-    [m]."""
+    """Compute the largest torsion [N m] as in `torsion_capacity`, and its derivative by the grip
+    [m].
+
+    Args:
+        grip: friction that the tangential force leaves [N].
+        squared: squared tangential force [N^2].
+        twist, half: lengths c and h / 2 of (1) [m].
+    """
     s = grip**2 / (grip**2 + squared)
     bend = BEND * twist
     # h / 2 + s (c - h / 2) - bend s (1 - s)
@@ -151,7 +157,8 @@ def _squared(tangent: Expression) -> Expression:
 
 
 def _half_spread(patch: SoftPatch, tangent: Expression) -> Expression:
-    """Compute h / 2 of (1) for a tangential force [m]."""
+    """Compute the length h / 2 of (1) [m] for the direction of a tangential force `tangent`
+    (2,)."""
     spread = ca.mtimes(number(patch.spread), tangent)
     return ca.sqrt(ca.sumsqr(spread) / _squared(tangent) + 1e-24) / 2.0
 
@@ -184,7 +191,8 @@ def least_soft_squeeze(
     rest = moment - ca.cross((arms[0] + arms[1]) / 2.0, force)
 
     def shared(squeeze: Expression) -> Load:
-        """Compute the loads of both contacts for a sum `squeeze` of the normal forces."""
+        """Compute the tangential force (2,) of each contact [N] and the common torsion [N m], if
+        the sum of the normal forces is `squeeze` [N]."""
         half = ca.vertcat(
             (rest[1] + apart[0] * squeeze / 2.0) / apart[2],
             (apart[1] * squeeze / 2.0 - rest[0]) / apart[2],
@@ -219,14 +227,16 @@ def _pressed(
     patches: tuple[SoftPatch, SoftPatch],
     implicit: ImplicitVariables | None,
 ) -> tuple[Expression, Expression]:
-    """Compute the least normal forces (2,) [N] and torsion capacities (2,) [N m] for given
-    tangential forces.
+    """Compute the least normal forces (2,) [N] for given tangential forces and torsion, and the
+    torsion capacities (2,) [N m] at these forces.
 
     Args:
-        load: tangential force (2,) of each contact [N], and the torsion of both together [N m].
+        load: tangential force (2,) of each contact [N], and the torsion that both bear together [N
+            m].
         difference: N_1 - N_2 [N].
-        friction, patches: friction coefficients (2,) and patches of both pads.
-        implicit: collector of results of Newton's method, for exact derivatives.
+        friction: (2,) Coulomb coefficients.
+        patches: patches of both pads.
+        implicit: collector of results of Newton's method, for exact derivatives; None for none.
     """
     *tangents, torsion = load
     asked, squares = ca.fabs(torsion), [_squared(tangent) for tangent in tangents]
@@ -281,13 +291,14 @@ def _first_grip(
     squared: Both,
     ahead: Expression,
 ) -> Expression:
-    """Estimate the grip of the pad that slips first [N], with torsion levers linear in s.
+    """Estimate the grip of the pad that slips first [N], for torsion levers linear in s of (1). In
+    all pairs this pad comes first.
 
     Args:
-        asked: absolute torsion of both pads together [N m].
-        levers: c and h / 2 of both pads [m]. In all pairs the pad that slips first comes first.
-        share: friction of the other pad over that of the first.
-        squared: squares of both tangential forces [N^2].
+        asked: absolute torsion that both pads bear together [N m].
+        levers: lengths c of the two pads, and lengths h / 2 of the two pads [m].
+        share: friction coefficient of the other pad over the coefficient of the first.
+        squared: squared tangential forces of the two pads [N^2].
         ahead: squared grip of the other pad when the first begins to slide without torsion [N^2].
     """
     twist, half = levers

@@ -136,11 +136,13 @@ class SoftGrasp:
 
 
 class _Local:
-    """Derivatives of f at a state: of the barriers, patch by patch, and of log effort. The
-    curvature of log effort, Q / effort - g g', is a rank-one change of a diagonal.
+    """Derivatives of the objective f of the module at given states (n,) of all patches.
+
+    f is the sum of the barriers, patch by patch, and log effort. The curvature of log effort, Q /
+    effort - g g', is a rank-one change of a diagonal.
 
     Attributes:
-        slope: gradient (n,) of f, the sum of g and the gradient of the barriers.
+        slope: gradient (n,) of f: the gradient g of log effort plus that of the barriers.
     """
 
     def __init__(self, program: SoftGrasp, state: ca.SX) -> None:
@@ -158,11 +160,11 @@ class _Local:
         self._share = 1.0 / (1.0 - ca.dot(self._g, self._answer))
 
     def solve(self, pull: ca.SX) -> ca.SX:
-        """Solve Y' F Y y = Y' pull and return Y y (n,)."""
+        """Solve Y' F Y y = Y' pull for y and return the change Y y (n,) of the states."""
         return self._with_g(self._effort * self._equations.balanced_change(pull))
 
     def by_load(self) -> ca.SX:
-        """Compute the derivatives U (n, 6) of the state by the load."""
+        """Compute the derivatives U (n, 6) of the states by the load."""
         return self._with_g(self._equations.constrained(self._loaded))
 
     def _with_g(self, found: ca.SX) -> ca.SX:
@@ -175,7 +177,8 @@ class _Local:
         return found + ca.mtimes(self._answer, self._share * ca.mtimes(self._g.T, found))
 
     def third(self, along: ca.SX, by_load: ca.SX) -> ca.SX:
-        """Compute U' T[d] U for a direction d (n,)."""
+        """Compute U' T[d] U (6, 6), the third derivative of f along `along` = d (n,) and twice
+        along `by_load` = U (n, 6)."""
         rows = zip(
             self._program.grasp.patches,
             self._owns,

@@ -205,8 +205,8 @@ def case_slack_function(workcell: Workcell, commanded: int = 1) -> ca.Function:
 def _program_and_inputs(
     workcell: Workcell, commanded: int = 1
 ) -> tuple[GraspSqueeze | None, dict[str, Expression]]:
-    """Return the program of pads with any normals, None for other pads, and the inputs of functions
-    of least forces by name."""
+    """Return the convex program of pads with any normals (None for other pads), and the inputs of
+    functions of least forces by name."""
     if command_model(workcell).has_scalar_squeeze:
         return None, _inputs(ca.SX, sx_parameters(workcell.payload))
     squeeze = GraspSqueeze(workcell, commanded)
@@ -214,7 +214,8 @@ def _program_and_inputs(
 
 
 def _inputs(kind: Any, given: Mapping[str, Expression]) -> dict[str, Expression]:
-    """Return symbols for motion, case and parameters by name."""
+    """Return symbols of type `kind` (SX or MX) by name: pose, rate, second_rate (6,) and case
+    (18,), then the parameters `given`."""
     motion = {name: kind.sym(name, 6) for name in MOTION}
     return motion | {"case": kind.sym("case", CASE_SIZE)} | dict(given)
 
@@ -228,9 +229,15 @@ def _least_force(
     displaced: bool = False,
     beside: Expression | float = 0.0,
 ) -> Expression:
-    """Build the expression of the commanded normal forces (2,) [N].
+    """Build the expression of the least commanded normal forces (2,) in one case [N].
 
     Args:
+        workcell: the workcell.
+        squeeze: convex program of pads with any normals; None for other pads.
+        inputs: symbols by name: motion, case and parameters.
+        implicit: collector of results of Newton's method, for exact derivatives; None for none.
+        differentiable: True for exact first derivatives of the program's solution.
+        displaced: True if the case may displace two opposite pads.
         beside: additional load (6,) about the box frame's origin [N, N m], for pads with any
             normals.
     """
@@ -314,8 +321,8 @@ def _commanded_by_program(
     handed: dict[str, ca.MX],
     differentiable: bool = False,
 ) -> ca.MX:
-    """Build the expression of the commanded normal forces (2,) [N] of pads with any normals, for a
-    case with a known load (6,)."""
+    """Build the expression of the commanded normal forces (2,) [N] of pads with any normals, in a
+    case (18,) whose load (6,) is known."""
     friction, *_, displacement, tracking, internal = case_parts(case)
     commanded, given = squeeze.commanded, list(handed.values())
     sizes = _sizes_function(squeeze)(case, *given)
@@ -330,8 +337,8 @@ def _commanded_by_program(
 
 
 def _sizes_function(squeeze: GraspSqueeze) -> ca.Function:
-    """Build the function from a case to the sizes (2,) of the robots' patches over the cell's own
-    sizes."""
+    """Build the function from a case (18,) to the sizes (2,) of the robots' patches over the cell's
+    own sizes."""
     case = ca.SX.sym("case", CASE_SIZE)
     radius = case_parts(case)[1]
     own = [ca.SX(number(contact.patch_radius)) for contact in squeeze.workcell.contacts]

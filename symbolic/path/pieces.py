@@ -108,7 +108,8 @@ def hierarchical_basis(task: Task) -> tuple[Array, Array]:
 
 
 def _steps(pieces: int) -> list[int]:
-    """Return the strides of the grids from the waypoints of the file to all."""
+    """Return the distance of neighbouring waypoints in each grid, counted in waypoints of the
+    refined task, from the coarsest grid to 1."""
     steps = [pieces]
     while steps[-1] > 1:
         steps.append(steps[-1] // 2 if steps[-1] % 2 == 0 else 1)
@@ -141,7 +142,8 @@ def resample_decisions(x: Array, source: Task, target: Task) -> Array:
 
 @cache
 def _through(n: int, m: int) -> Array:
-    """Compute the matrix (m, n) from n waypoints to m waypoints evenly spaced on their path."""
+    """Compute the matrix (m, n) that maps n waypoints to m points of their spline, evenly spaced in
+    u."""
     u = np.linspace(0.0, 1.0, m)
     by = path_position(n, u).copy()
     known, where = np.divmod(np.arange(m) * (n - 1), m - 1)

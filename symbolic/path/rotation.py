@@ -81,7 +81,8 @@ def _quaternion(v: Expression) -> Quaternion:
 def _quaternion_rates(
     v: Expression, rate: Expression, second: Expression
 ) -> tuple[Quaternion, Quaternion]:
-    """Compute the first and second time derivative of the unit quaternion of a rotation vector."""
+    """Compute the first and second time derivative of the unit quaternion of a rotation vector `v`
+    (3,), from the first and second time derivative of `v`."""
     square = ca.sumsqr(v)
     moved, pushed = 2.0 * ca.dot(v, rate), 2.0 * (ca.sumsqr(rate) + ca.dot(v, second))
     real, share = (_derivatives(each, square, moved, pushed) for each in (_COSINE, _SINE))
@@ -96,7 +97,7 @@ def _derivatives(
     series: Sequence[float], square: Expression, moved: Expression, pushed: Expression
 ) -> Quaternion:
     """Compute the first and second time derivative of a power series in `square`, from the first
-    and second time derivative of `square`."""
+    (`moved`) and second (`pushed`) time derivative of `square`."""
     first = [n * c for n, c in enumerate(series)][1:]
     slope = _series(first, square)
     bend = _series([n * c for n, c in enumerate(first)][1:], square)

@@ -97,7 +97,7 @@ NONE: Handed = MappingProxyType({})
 
 
 def _fixed(task: Task, value: Any, x: Expression, handed: Handed) -> Expression:
-    """Return a parameter of the task as the same kind of expression as x."""
+    """Return a parameter of the task as an expression of the type of `x`."""
     if isinstance(x, ca.MX) and isinstance(value, ca.SX):
         return as_mx(value, sx_parameters(task), handed)
     return type(x)(number(value))
@@ -165,9 +165,9 @@ def extended_matrix(
 
 
 def _unwrap(reference: Expression, angles: Expression) -> Expression:
-    """Move angles by full turns to lie within half a turn of the reference.
+    """Return angles moved by full turns to within half a turn of the angles `reference` [rad].
 
-    Half a turn in either direction stays as it is written (NumPy's `unwrap`).
+    A difference of exactly half a turn keeps its sign (as in NumPy's `unwrap`).
     """
     difference = angles - reference
     turns = ca.sign(difference) * ca.ceil(ca.fabs(difference) / (2.0 * np.pi) - 0.5)

@@ -100,7 +100,13 @@ def driven_path(
 def _along(
     time: ca.MX, path: tuple[ca.MX, ca.MX, ca.MX], speed: ca.MX, acceleration: ca.MX
 ) -> TimedPath:
-    """Compute the timed path from the pose and its derivatives by u, and from u' and u''."""
+    """Compute the timed path.
+
+    Args:
+        time: (1, n) times of the samples [s].
+        path: (6, n) box poses, and their first and second derivatives by u.
+        speed, acceleration: (1, n) u' [1/s] and u'' [1/s^2].
+    """
     (pose, first, second), rows = path, ca.repmat(1.0, 6, 1)
     pushed = second * ca.mtimes(rows, speed**2) + first * ca.mtimes(rows, acceleration)
     return TimedPath(time, pose, first * ca.mtimes(rows, speed), pushed)
@@ -117,8 +123,12 @@ def _constant(task: Task, pose: ca.MX, rounding: ca.MX | None, handed: Handed) -
 
 
 def _step_time_function(task: Task, is_rounded: bool) -> ca.Function:
-    """Build the function of the duration of a step between two poses (paper Eqs. 23-24). With
-    `is_rounded` the kink between translation and rotation is rounded by a relative width."""
+    """Build the function of the duration of the step between two poses, start and end (6,) [s]
+    (paper Eqs. 23-24).
+
+    With `is_rounded` the third input is a relative width that smooths the maximum of translation
+    and rotation time.
+    """
     start, end, given = ca.SX.sym("start", 6), ca.SX.sym("end", 6), sx_parameters(task).values()
     step = end - start
     length = _smooth_norm(step[:3])
@@ -135,8 +145,8 @@ def _step_time_function(task: Task, is_rounded: bool) -> ca.Function:
 
 
 def _gradient(values: ca.MX, durations: ca.MX) -> ca.MX:
-    """Compute second-order finite differences along the columns on uneven steps, one-sided at
-    the ends."""
+    """Compute time derivatives of `values` (k, n) at n samples by second-order finite differences,
+    one-sided at the ends; `durations` (1, n - 1) are the steps in time."""
     rows = values.shape[0]
     before, after = durations[:, :-1], durations[:, 1:]
     step = ca.repmat(1.0, rows, 1)
@@ -151,7 +161,11 @@ def _gradient(values: ca.MX, durations: ca.MX) -> ca.MX:
 
 
 def _one_sided(here: ca.MX, near: ca.MX, far: ca.MX, near_step: ca.MX, far_step: ca.MX) -> ca.MX:
-    """Compute the derivative at `here` of the parabola through three values with signed steps."""
+    """Compute the derivative at `here` of the parabola through three values.
+
+    The step from `here` to `near` is `near_step`, the step from `near` to `far` is `far_step`; both
+    are negative if they lead backwards.
+    """
     total = near_step + far_step
     return (
         -(2.0 * near_step + far_step) / (near_step * total) * here
@@ -179,8 +193,12 @@ def _ramped(
 
 
 def _length_rate_function(task: Task) -> ca.Function:
-    """Build the function of the arc length per unit of u and its derivative by u. Rotation counts
-    as length by the ratio of the reference speeds."""
+    """Build the function from pose, first and second derivative by u, (6,) each, to the arc length
+    per unit of u [m] and its derivative by u.
+
+    A rotation counts as a length by the ratio of the reference speeds; the longer of translation
+    and rotation is the arc length.
+    """
     pose, first, second = (ca.SX.sym(name, 6) for name in ("pose", "first", "second"))
     lever = task.reference_speed / task.reference_angular_speed
     turn = angular_velocity(task.orientation, pose[3:], first[3:])
@@ -195,8 +213,8 @@ def _length_rate_function(task: Task) -> ca.Function:
 
 
 def _ramp_function(task: Task) -> ca.Function:
-    """Build the function of time, speed and acceleration at an arc length, for a smooth
-    rest-to-rest motion."""
+    """Build the function from arc length and total arc length [m] to time [s], speed [m/s] and
+    acceleration [m/s^2] of a smooth motion from rest to rest."""
     arc, total = ca.SX.sym("arc"), ca.SX.sym("total")
     ramp = task.ramp_time
     cruise = ca.fmin(task.reference_speed, total / ramp)

@@ -30,9 +30,9 @@ Rotation = Literal["roll-pitch-yaw", "quaternion"]
 class Orientation:
     """Convention by which three numbers [rad] describe R_world_box.
 
-    'roll-pitch-yaw' is the paper's: Rz(yaw) Ry(pitch) Rx(roll). 'quaternion' is a rotation vector v
-    along the world's axes with the unit quaternion (cos |v|/2, sin |v|/2 v/|v|): R_world_box =
-    exp(v) R_reference.
+    'roll-pitch-yaw' is the paper's convention: Rz(yaw) Ry(pitch) Rx(roll). 'quaternion' is a
+    rotation vector v along the world's axes: R_world_box = exp(v) R_reference, where exp(v) rotates
+    about v by the angle norm(v).
 
     Attributes:
         rotation: 'roll-pitch-yaw' or 'quaternion'.

@@ -134,7 +134,8 @@ def driven_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def _value(model: CellModel, inputs: list[ca.SX], implicit: ImplicitVariables) -> ca.SX:
-    """Return the quantities of `driven_layout` at a point."""
+    """Compute the quantities (size,) of `driven_layout` at one point from the inputs of
+    `driven_functions`."""
     workcell = model.workcell
     limits, joints = limit_layout(workcell), limit_layout(workcell).joints
     *path, a, w = inputs

@@ -41,8 +41,8 @@ DIRECTION_NUMBERS = 12
 
 
 def _directions() -> Array:
-    """Return the coefficients (SEPARATING_DIRECTIONS, DIRECTION_NUMBERS) of all separating
-    directions, as `direction` takes them."""
+    """Return one row of coefficients per separating direction, (SEPARATING_DIRECTIONS,
+    DIRECTION_NUMBERS), with the obstacle's vectors along the obstacle's axes."""
     found = []
     for first, axes in ((0, 1), (3, 1), (6, 3)):
         for k in range(3):

@@ -236,13 +236,15 @@ def _at_samples(
     columns: tuple[int, ...],
     handed: dict[str, ca.MX],
 ) -> ca.MX:
-    """Evaluate a function of the motion at the chosen columns of the timed path.
+    """Build the values of a function of the motion at chosen samples, one after the other in a
+    column.
 
     Args:
-        of_motion: function of the motion at one sample.
+        workcell: the cell.
+        of_motion: function of pose, rate, second_rate (6,) and the payload's parameters.
         along: basis, waypoints and rounding for `timed_path`.
-        columns: indices of the samples.
-        handed: parameters of task and payload as inputs.
+        columns: indices of the samples among those of the basis.
+        handed: parameters of task and payload by group.
     """
     path, at = (
         timed_path(workcell.task, *along, select_parameters(handed, workcell.task)),
@@ -254,8 +256,8 @@ def _at_samples(
 
 
 def _wrench_function(workcell: Workcell) -> ca.Function:
-    """Build the function from pose, rate and second_rate (6,) of a sample to the required force and
-    moment (6,) about the centre of mass, in the box frame [N, N m]."""
+    """Build the function from pose, rate and second_rate (6,) of a sample to the required force [N]
+    and the required moment about the centre of mass [N m], (6,), box axes."""
     payload = workcell.payload
     pose, rate, second = motion = [ca.SX.sym(name, 6) for name in MOTION_INPUTS]
     centre = number(payload.centre_of_mass)
@@ -265,8 +267,8 @@ def _wrench_function(workcell: Workcell) -> ca.Function:
 
 
 def _margin_function(workcell: Workcell) -> ca.Function:
-    """Build the function from force and moment (6,) in the box frame to 1 - (shift / patch
-    radius)^2 (2,)."""
+    """Build the function from force and moment (6,) about the centre of mass, box axes, to the
+    margin 1 - (shift / patch radius)^2 of each contact's centre of pressure, (2,)."""
     wrench, contacts = ca.SX.sym("wrench", 6), workcell.contacts
     shift = contact_model(workcell).hold(_contact_load(workcell, wrench))
     squares = ca.vertcat(*map(ca.sumsqr, shift.shifts))
@@ -277,7 +279,7 @@ def _margin_function(workcell: Workcell) -> ca.Function:
 
 def _load_function(workcell: Workcell) -> ca.Function:
     """Build the function from force and moment (6,) about the centre of mass to force and moment
-    about the box frame's origin."""
+    (6,) about the box frame's origin, both along the box's axes [N, N m]."""
     wrench, centre = ca.SX.sym("wrench", 6), number(workcell.payload.centre_of_mass)
     about = wrench[3:] + ca.cross(ca.SX(centre), wrench[:3])
     given = sx_parameters(workcell.payload).values()
@@ -285,8 +287,8 @@ def _load_function(workcell: Workcell) -> ca.Function:
 
 
 def _force_function(workcell: Workcell) -> ca.Function:
-    """Build the function from force and moment (6,) in the box frame to the quantities (2,) of
-    `ContactModel.force_quantities`, whose linear branches are the normal forces."""
+    """Build the function from force and moment (6,) about the centre of mass, box axes, to the two
+    quantities (2,) of `ContactModel.force_quantities` [N]."""
     wrench, model = ca.SX.sym("wrench", 6), contact_model(workcell)
     load = _contact_load(workcell, wrench)
     quantities = model.force_quantities(load, model.hold(load))
@@ -295,8 +297,8 @@ def _force_function(workcell: Workcell) -> ca.Function:
 
 
 def _contact_load(workcell: Workcell, wrench: ca.SX) -> ContactLoad:
-    """Return the record of a contact load for a force and moment (6,) about the centre of mass, in
-    the box frame [N, N m]."""
+    """Return the load on the contacts along the box's axes, for the required force and moment (6,)
+    about the centre of mass [N, N m]."""
     contacts, centre = workcell.contacts, workcell.payload.centre_of_mass
     first, second = (ca.SX(number(c.T_box_pad[:3, 3] - centre)) for c in contacts)
     axes = ca.SX(number(contacts[0].T_box_pad[:3, :3]))
