@@ -96,8 +96,8 @@ class ArmMotion:
 class Carry(Displayable):
     """A carry with its timing and every physical quantity; n samples, world frame, read-only.
 
-    At the joint between two pieces of constant path acceleration a sample may stand twice, once
-    for each side.
+    Where two pieces of constant path acceleration meet there may be two samples of the same time,
+    one with the values before and one with the values after.
 
     Attributes:
         workcell: the description of the cell.
@@ -110,9 +110,11 @@ class Carry(Displayable):
             acceleration [rad/s^2] of the box.
         normal_force, tangential_force: (n, 2) normal and tangential force of each robot [N].
         contact_force: (n, 2, 3) force vector of each robot on the box [N].
-        pressure_shift: (n, 2) shift of the centre of pressure at each contact [m].
-        point_moment_residual: (n, 3) moment missing with the forces at the nominal points [N m].
-        moment_residual: (n, 3) moment missing with the pressure shifted [N m].
+        pressure_shift: (n, 2) length of the shift of the centre of pressure at each contact [m].
+        point_moment_residual: (n, 3) required moment about the centre of mass less the moment of
+            the contact forces, if these act at the nominal contact points [N m].
+        moment_residual: (n, 3) required moment about the centre of mass less the moment of the
+            contacts, if the forces act at the shifted centres of pressure [N m].
         arms: the motion of each robot's joints.
         judgement: feasibility and objectives of the candidate, None if not evaluated.
     """
@@ -208,12 +210,14 @@ class Carry(Displayable):
 
     @property
     def peak_pressure_shift(self) -> Array:
-        """(2,) largest shift of each centre of pressure [m]."""
+        """(2,) largest shift of the centre of pressure at each contact [m]."""
         return np.asarray(self.pressure_shift.max(axis=0))
 
     @property
     def peak_contact_torque_use(self) -> Array:
-        """(2,) for each arm, the largest ratio of a contact torque to the joint's torque limit."""
+        """(2,) for each arm, the largest ratio of a joint torque of the contact wrench to the
+        joint's torque limit.
+        """
         return np.array(
             [
                 float((np.abs(arm.contact_torque) / robot.torque_max).max())

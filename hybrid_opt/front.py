@@ -176,7 +176,9 @@ class Front(Displayable):
         return metrics.hypervolume(self.objectives, point if reference is None else reference)
 
     def spacing(self) -> float:
-        """Compute the standard deviation of nearest-neighbour distances on the front; 0 is even."""
+        """Compute the standard deviation of the distances between nearest neighbours on the front,
+        in objective space; 0 for an evenly spaced front.
+        """
         return metrics.spacing(self.objectives)
 
     def _peaks(self) -> Array:

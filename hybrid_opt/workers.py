@@ -65,7 +65,7 @@ class Workers(ABC):
                 finished call.
 
         Raises:
-            DualArmError: a call failed with this text, or worker processes died.
+            DualArmError: a call failed, or worker processes died; the message states the reason.
         """
         results: dict[int, Result] = {}
         try:

@@ -1,5 +1,6 @@
-"""Settings of a campaign and the source of its randomness; the small files of its results folder as
-records, and their paths (docs/reference/results.md)."""
+"""Settings of a campaign, its random generators, and the small files of its results folder: their
+content as records, and their paths (docs/reference/results.md).
+"""
 
 from __future__ import annotations
 

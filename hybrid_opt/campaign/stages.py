@@ -1,4 +1,4 @@
-"""Stages of a study, each run once and marked as done; cells as values for any process or machine;
+"""Stages of a study, each run once and marked as done; the cells that stages load in any process;
 and the parallel build of all compiled functions.
 
 A stage reads the results of earlier stages in the results folder and writes files of its own. Its

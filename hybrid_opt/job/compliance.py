@@ -306,7 +306,7 @@ def position_text(found: Sequence[PositionControl]) -> str:
 
 
 def skew_text(found: Sequence[Skew]) -> str:
-    """Format a table of the effects of a late arm, one row per delay."""
+    """Format a table of the effects of a late arm on the contact forces, one row per delay."""
     rows = [
         [
             f"{1e3 * each.delay:g}",

@@ -1,7 +1,8 @@
-"""Motions and forces of the phases of a job: straight lines, rest, and the timed carry; and the
-utilisation of each limit in every phase.
+"""Motions and forces of the phases of a job: straight lines, rest, and the timed carry; and how far
+each phase uses its limits.
 
-Every phase except the carry follows a smooth profile h(t/T) from 0 to 1 with
+Every phase except the carry follows a smooth profile h(s) from 0 to 1, with s the time from the
+beginning of the phase over its duration:
 
     h = 35 s^4 - 84 s^5 + 70 s^6 - 20 s^7,
 

@@ -1,8 +1,9 @@
-"""Margins of the cell's description at the commanded force, and effects of changes of the cell.
+"""Margins of a cell's description at the commanded force, and effects of changes of the cell on a
+carry.
 
-The commanded force is the force of the worst case at the sample that needs most. The effect of a
-change of the cell on it is a difference of two forces. It is converted to a duration by timings of
-the path within other force limits.
+The commanded force is the force that the worst case needs at the most demanding sample. A change of
+the cell changes this force; the change is the difference of the forces in both cells. Timings of
+the path within other force limits convert it to a change of the duration.
 """
 
 from __future__ import annotations

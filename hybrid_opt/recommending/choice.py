@@ -1,8 +1,8 @@
-"""Choice of a carry for a wish among the paths of a drivable front.
+"""Choice of a carry among the paths of a drivable front, according to a wish.
 
 Every path is timed within several limits of the planned force. Each timing is an option: a duration
-of the carry, and a commanded force that holds the box in every case of the cell's uncertainty. The
-target of a wish is one of these two; a wish may also replace numbers of the cell.
+of the carry, and a commanded force that holds the box in every case of the cell's uncertainty. A
+wish limits the duration or the force of an option, and may replace numbers of the cell.
 """
 
 from __future__ import annotations

@@ -1,23 +1,27 @@
-"""Cases of an uncertainty set: the worst ones, random ones, and those that decide the forces.
+"""Cases of an uncertainty: the worst cases, random cases, and the cases that decide the forces.
 
-The worst cases follow from the least squeeze that holds a case:
+A case is one set of true values of friction, mass and the other uncertain quantities. The worst
+cases follow from the least squeeze that holds a case:
 
-- It falls with friction, because the friction cones grow. So both coefficients are least.
+- The least squeeze falls with friction, because the friction cones grow. So both friction
+  coefficients are least.
 - It is proportional to the mass. So the mass is largest.
 - It is convex in the required force and moment. These are affine in the centre of mass and in the
   disturbance separately (`symbolic.contact.worst_cases`). So it is largest at vertices of both
   ranges.
-- Two pads with opposite normals that are both displaced by e shift the centre of mass by e relative
-  to them. Pads displaced in opposite directions turn the squeeze into a moment. A difference of
-  the tangential forces of up to 2 e N / L each balances it, L being the distance of the pads. This
-  is covered by a coefficient of friction that is lower by 2 e / L. Applying both at once costs at
-  most 0.3 % of the force. The error of the arms' relative pose adds to 2 e.
+- If two pads with opposite normals are both displaced by e [m], the centre of mass shifts by e
+  relative to them. Pads displaced in opposite directions turn the squeeze N [N] into a moment. A
+  difference of the tangential forces of up to 2 e N / L each balances this moment, L being the
+  distance of the pads [m]. A coefficient of friction that is lower by 2 e / L covers it. To apply
+  the shift and the lower friction at once costs at most 0.3 % of the force. The error of the arms'
+  relative pose adds to 2 e.
 - For pads with any normals the corners of squares around the discs of displacements are used. To
   first order in e no displacement between them is worse; random cases check the rest.
-- A pad tilted by t against its face presses along its own axis. The cone about that axis within
-  the face's friction cone has the coefficient tan(atan mu - t), exact in the worst direction.
-- The commanded force grows with the share of it that may be missing, and with the opposed force
-  (`symbolic.contact.worst_cases`).
+- A pad tilted by an angle t against its face presses along its own axis. The cone about that axis
+  within the face's friction cone has the coefficient tan(atan mu - t), with mu the friction
+  coefficient; it is exact in the worst direction.
+- The commanded force grows with the share of it that may be missing, and with the tangential force
+  between the arms, called opposed force (`symbolic.contact.worst_cases`).
 """
 
 from __future__ import annotations
