@@ -142,7 +142,13 @@ violated all the time."""
 
 class Evaluator(Protocol):
     """Interface that a search needs from an evaluator, such as
-    `hybrid_opt.evaluate.evaluation.CandidateEvaluator`."""
+    `hybrid_opt.evaluate.evaluation.CandidateEvaluator`.
+
+    Attributes:
+        objective_names: names of the objectives.
+        n_var: number of decision variables.
+        lower, upper: (n_var,) bounds of the decision variables.
+    """
 
     objective_names: tuple[str, ...]
     n_var: int

@@ -109,8 +109,10 @@ class Attempt:
     """One attempt to improve a front.
 
     Attributes:
-        aim, parent, start: as in `hybrid_opt.polishing.records.PolishOutcome`.
+        aim: what is looked for, see `hybrid_opt.polishing.records.PolishOutcome`.
+        parent: index of the point of the given front that is improved, -1 for a new point.
         x: (n_var,) decision vector of the start.
+        start: (2,) objectives of the start.
     """
 
     aim: Aim

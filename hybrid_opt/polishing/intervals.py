@@ -368,9 +368,10 @@ class LinearisedRows:
 class PathTimingProgram:
     """Program of path and timing about one iterate.
 
-    Variables z = (xi, omega): the waypoints that are moved, scaled to [-1, 1] by their bounds, and
-    the squared speeds at the inner grid points as u'^2_i = w_i (1 + omega_i). With the duration T,
-    the force limit F, and the iterate (xi, w) with duration T_0,
+    Its variables z = (xi, omega) are the moved waypoints, scaled to [-1, 1] by their bounds, and
+    relative changes omega of the iterate's squared speeds w at the inner grid points: u'^2_i = w_i
+    (1 + omega_i). With the duration T, the iterate's duration T_0 and the force limit F, the
+    program is::
 
         minimise    T / T_0
         subject to  every limit at both ends of every interval <= 1, normal forces <= F
@@ -383,11 +384,12 @@ class PathTimingProgram:
 
     Attributes:
         place_rows: geometric rows, in order.
-        n, n_path: variables, and those that move the path.
-        speeds: slice of the squared speeds among the variables.
+        n, n_path: number of variables, and of those that move the path.
+        speeds: slice of omega among the variables.
         total: duration of the iterate [s].
-        rows: (points, kinds) values of the timing's rows less their bounds, unscaled.
-        geometry: (geometric rows,) violations.
+        rows: (points, kinds) timing rows at the iterate: limited quantities over their bounds, less
+            one.
+        geometry: (geometric rows,) violations at the iterate, negative where a row is satisfied.
     """
 
     def __init__(

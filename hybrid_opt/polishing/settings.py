@@ -51,7 +51,8 @@ class FillSettings:
 
     Attributes:
         solved: number of points up to which gaps are filled by solves.
-        members: wanted number of points of the front; the rest lies on chords between neighbours.
+        members: wanted number of points of the front. Those beyond `solved` lie on chords, straight
+            lines between neighbours' decision vectors.
         attempts: largest number of attempts in gaps for each of `PolishSettings.attempts`; twice as
             many if the front stays short.
     """

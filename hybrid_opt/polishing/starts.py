@@ -173,7 +173,7 @@ def mirror_of(workcell: Workcell) -> Mirror | None:
     """Return the reflection about the plane that halves the line between both bases.
 
     None if the line is not parallel to a horizontal world axis, if the arms have redundant joints,
-    or if the reflection moves the start or the goal of the box.
+    or if the reflection moves a fixed waypoint of the box.
     """
     task = workcell.task
     first, second = (robot.T_world_base[:3, 3] for robot in workcell.robots)
