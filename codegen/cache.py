@@ -59,7 +59,7 @@ _KEY_END = re.compile("[-.]")
 def key_of(what: str, **parts: object) -> str:
     """Return the key of a cache entry: a digest of its kind and of all its ingredients.
 
-    Every key of a cache is computed here. The ingredients of each kind are:
+    Every key of a cache is computed here. The ingredients of each kind are::
 
       library        text of the source, compiler, its level and flags (`codegen.build`)
       part           the same for an object file that several libraries share

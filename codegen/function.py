@@ -167,12 +167,13 @@ class NumericFunction(ABC):
         """Evaluate n candidates.
 
         Args:
-            inputs: one array per input, (n, *shape), or (*shape) where all candidates share it.
+            inputs: one array per input: (n, ...) with its shape in `input_shapes` after n, or of
+                this shape alone, shared by all candidates.
             threads: threads to spread the candidates over; 0 for one per core that this process
                 may use. The results do not depend on it. Interpreted functions use one.
 
         Returns:
-            The outputs by name, (n, *shape).
+            The outputs by name, each (n, ...) with its shape in `output_shapes` after n.
 
         Raises:
             CodegenError: inputs that do not fit or agree on n, or the function failed.
@@ -224,7 +225,8 @@ class NumericFunction(ABC):
         Args:
             n: largest number of evaluations, at least 1.
             shared: names of inputs with one value for all evaluations.
-            given: the caller's own arrays for some inputs and outputs, (n, *shape), C-contiguous.
+            given: the caller's own arrays for some inputs and outputs, each
+                C-contiguous and (n, ...) with its shape after n; shared inputs without n.
 
         Raises:
             CodegenError: an array does not fit.

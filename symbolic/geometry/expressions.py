@@ -2,7 +2,7 @@
 
 A lower bound of a distance stays a lower bound if every operation in it errs downwards, or upwards
 where its result is subtracted. `EXACT` computes the sharpest bound, with kinks. `Softness(w)`
-replaces each kink by a hyperbola of width w, which has derivatives of every order:
+replaces each kink by a hyperbola of width w, which has derivatives of every order::
 
   |x|  <=  sqrt(x^2 + w^2)              exceeds |x| by at most w,
   max(a, b)  >=  (a + b + sqrt((a-b)^2 + w^2) - w) / 2    falls short by at most w / 2,

@@ -58,7 +58,7 @@ class StartBranch:
         clearance: least clearance bound of this arm along the trajectory [m]; infinite if no bound
             is computed.
         limit_margin: least distance to a joint limit along the trajectory [rad].
-        manipulability: least |det J| along the trajectory [m^3].
+        manipulability: least abs(det(J)) of the flange along the trajectory [m^3].
         path: (samples, n) joints along the trajectory [rad].
     """
 
