@@ -22,9 +22,9 @@ class Range:
     """Allowed range of a number.
 
     Attributes:
-        low, high: lowest and highest value.
-        unit: SI unit, empty for a pure number.
-        mistaken: units that people write by mistake, each (name, factor to `unit`).
+        low, high: lowest and highest allowed value.
+        unit: SI unit; '' for a pure number.
+        mistaken: units that people write by mistake, each with its name and its factor to `unit`.
     """
 
     low: float
@@ -128,7 +128,7 @@ def evenly(count: int, most: int) -> NDArray[np.intp]:
 
 
 def set_read_only(record: object) -> None:
-    """Make the arrays of a record read-only."""
+    """Make every array field of a record read-only, in place."""
     for value in vars(record).values():
         if isinstance(value, np.ndarray):
             value.setflags(write=False)

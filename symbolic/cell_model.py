@@ -95,7 +95,8 @@ def build_cell_bodies(workcell: Workcell, known: CellBodies | None = None) -> Ce
 
 
 def _compared(bodies: CellBodies) -> tuple[object, ...]:
-    """Return the pairs between which functions compute distances, grouped in blocks."""
+    """Return the pairs of bodies whose distances the cell's functions compute, and how many of
+    these pairs, from the first, are near."""
     return bodies.geometry.possible, bodies.geometry.near
 
 
@@ -105,14 +106,14 @@ Searches = tuple[ArmSearch, ArmSearch]
 def build_cell_model(
     workcell: Workcell, bodies: CellBodies | None = None, searches: Searches | None = None
 ) -> CellModel:
-    """Read the models of both robots and all bodies of a workcell, list all start branches of each
-    arm, and choose one per arm.
+    """Build the model of a cell: read both robots and all bodies, list the start branches of each
+    arm, and choose one branch per arm.
 
-    The index `start_branch` in the workcell selects one of the ranked branches; -1 selects the
+    `start_branch` in the workcell selects a branch by its index in the ranking; -1 selects the
     best.
 
     Args:
-        workcell: the description of the cell.
+        workcell: description of the cell.
         bodies: arms and bodies of a cell that differs only in the path; None to read them.
         searches: compiled functions that search for the start branches of both arms; None for
             interpreted ones.

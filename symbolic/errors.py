@@ -18,7 +18,7 @@ class DualArmError(Exception):
         """Identifier of the kind of error for programs, such as `not-json`. It stays the same when
         the message changes.
 
-        An error that was caused by another one has the code of the cause. An error without a code
+        An error that was caused by another error has the code of the cause. An error without a code
         has the name of its class.
         """
         cause = self.__cause__
@@ -34,7 +34,7 @@ class DualArmWarning(UserWarning):
 
 
 class OutsideError(DualArmError):
-    """A file of unknown origin is refused. The message says why but does not name the file."""
+    """A file of unknown origin was refused. The message says why, but does not name the file."""
 
 
 class WorkcellError(DualArmError):

@@ -118,7 +118,8 @@ def candidate_function(model: CellModel) -> ca.Function:
 
 
 def _all(model: CellModel) -> dict[str, ca.MX]:
-    """Return MX symbols for all parameter groups that the evaluation of a candidate uses."""
+    """Return MX vectors for all parameter groups that the evaluation of a candidate needs, by
+    group."""
     workcell = model.workcell
     return mx_parameters(workcell.task, *workcell.robots, model, workcell.payload)
 
@@ -304,7 +305,7 @@ def _forces_function(
     load: dict[str, ca.MX],
     handed: dict[str, ca.MX],
 ) -> ca.Function:
-    """Build the function `forces` of `sample_functions`."""
+    """Build the function `forces` that `sample_functions` describes."""
     workcell = model.workcell
     joints = [ca.MX.sym(f"q_{i + 1}", model.robots[i].n_joints) for i in (0, 1)]
     outputs = dict(load)
@@ -399,11 +400,15 @@ def _time_share(time: ca.MX) -> ca.MX:
 
 
 def arm_functions(model: CellModel) -> dict[str, ca.Function]:
-    """Build the functions that need no bodies, by name.
+    """Build the functions of a cell that do not depend on collision bodies, by name.
 
-    candidate: the evaluator of a whole candidate, see `candidate_function`.
-    inverse_dynamics_i: of each arm i = 1, 2 (`symbolic.robot.model`).
-    posture: both arms at one box pose (`symbolic.robot.arm.posture_function`).
+    candidate: evaluator of a whole candidate, see `candidate_function`.
+
+    inverse_dynamics_i, for arm i = 1, 2: joint torques that move the arm without the box, see
+    `symbolic.robot.model`.
+
+    posture: joint positions of both arms at one box pose, see
+    `symbolic.robot.arm.posture_function`.
     """
     return {
         "candidate": candidate_function(model),
@@ -413,8 +418,8 @@ def arm_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def cell_functions(model: CellModel) -> dict[str, ca.Function]:
-    """Build all compiled functions of a cell by name: those of `arm_functions`, and the distance
-    bounds of `symbolic.geometry.clearance.screening_functions`."""
+    """Build all compiled functions of a cell, by name: `arm_functions`, and the functions of
+    `symbolic.geometry.clearance.screening_functions` for the distances of bodies."""
     return arm_functions(model) | model.screening
 
 
@@ -442,10 +447,12 @@ def branch_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def kernel_functions(model: CellModel) -> dict[str, ca.Function]:
-    """Build the functions of a whole evaluation, to be composed sample by sample.
+    """Build the functions from which compiled code composes the evaluation of a candidate, by name.
 
-    path, start, predict, sample and, of some cells, forces: see `sample_functions`.
-    clearance, far_clearance, piece_poses: see `symbolic.geometry.clearance.screening_functions`.
+    path, start, predict, sample, and in some cells forces: see `sample_functions`.
+
+    clearance, far_clearance, piece_poses: distances and places of bodies, see
+    `symbolic.geometry.clearance.screening_functions`.
     """
     motions = [f"{block}motion" for block in model.geometry.blocks]
     screening = {name: f for name, f in model.screening.items() if name not in motions}

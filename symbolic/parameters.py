@@ -360,7 +360,8 @@ def _grasp(
 
 
 def _as(kind: Any, record: Any, **changes: Any) -> Any:
-    """Return a record of class `kind` with the fields of another record, some of them changed."""
+    """Return a record of the class `kind` with the fields of `record`, except those in
+    `changes`."""
     known = {each.name: getattr(record, each.name) for each in fields(record)}
     return kind(**(known | changes))
 
@@ -495,8 +496,11 @@ def _base(take: _Take, path: str, base: ScreenBase) -> ScreenBase:
 
 @lru_cache(maxsize=512)
 def _collected_body(seen: CacheKey) -> tuple[Any, list[tuple[Parameter, Array | LazyParameter]]]:
-    """Collect the parameters of one body. The result is cached, because variants of a cell share
-    most bodies."""
+    """Collect the parameters of one body: its topology, and each parameter with its values.
+
+    The result is cached, because variants of a cell share most bodies. `seen` holds the first part
+    of the parameters' key paths, and the body.
+    """
     take, (path, body) = _Collector(), seen.given
     return _body(take, path, body), take.entries.get(BODIES, [])
 

@@ -167,7 +167,7 @@ def json_value(content: bytes) -> Any:
 
 
 def toml_tables(content: bytes) -> dict[str, Any]:
-    """Parse a TOML document.
+    """Parse a TOML document into nested dictionaries.
 
     Raises:
         OutsideError: the content is not TOML or is nested too deeply.
@@ -367,8 +367,8 @@ def _alone(draft: Path, mode: int) -> Iterator[BinaryIO]:
 
 
 def _is_still(draft: Path, file: BinaryIO) -> bool:
-    """Return True if the path still refers to the open file. A former owner of the lock may have
-    renamed the file."""
+    """Return True if the path still refers to the open file, False if a former owner of the lock
+    has renamed the file."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), draft.stat(follow_symlinks=False))
     except FileNotFoundError:

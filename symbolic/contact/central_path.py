@@ -152,7 +152,7 @@ class Patch(ABC):
         negative outside."""
 
     def barrier(self, state: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Compute the barrier's gradient (n,) and Hessian (n, n) at a state."""
+        """Compute the barrier's gradient (n,) and Hessian (n, n) by the state at a state (n,)."""
         symbol = ca.SX.sym("state", self.state_size)
         curvature, slope = ca.hessian(self.potential(symbol), symbol)
         found = ca.substitute([ca.densify(slope), curvature], [symbol], [state])

@@ -310,8 +310,17 @@ class Grasp:
         return ca.vertcat(1.0, mu, mu, mu * (reach[robot] * radius))
 
     def _at(self, states: ca.SX, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
-        """Convert states (n,) of all pads, which are scaled by the nominal friction and patch
-        sizes, to states of the same forces scaled by other friction and sizes."""
+        """Rescale the states (n,) of all pads, one after the other, from the nominal friction and
+        patch sizes to others, for unchanged forces.
+
+        Args:
+            states: (n,) states scaled by the nominal friction and patch sizes.
+            friction: (2,) friction coefficients of the robots' pads.
+            reach: (2,) sizes of the robots' patches over the cell's own sizes.
+
+        Returns:
+            One state (4,) per pad.
+        """
         moved, owns = [], ca.vertsplit(states, self._ends)
         for pad, robot, state in zip(self._pads, self.robots, owns, strict=True):
             by_friction, by_reach = pad.friction / friction[robot], 1.0 / reach[robot]

@@ -84,7 +84,7 @@ def load_function(workcell: Workcell) -> ca.Function:
 
 
 def frictions(workcell: Workcell) -> ca.SX:
-    """Return the Coulomb coefficients (2,) of the contacts."""
+    """Return the Coulomb coefficients (2,) of the two robots' contacts."""
     return ca.vertcat(*[ca.SX(number(contact.friction)) for contact in workcell.contacts])
 
 
@@ -146,8 +146,7 @@ def _closed_load_function(workcell: Workcell) -> ca.Function:
 
 
 def _grasp_load_function(workcell: Workcell) -> ca.Function:
-    """Build the load function of pads whose forces the program of `symbolic.contact.grasp`
-    computes."""
+    """Build the function `uncertain_load` for pads whose forces a convex program computes."""
     inputs = {name: ca.MX.sym(name, size) for name, size in SIZES.items()}
     names = ("angular_velocity", "angular_acceleration", "force", "required_moment")
     given = [ca.SX.sym(name, size) for name, size in SIZES.items() if name != "friction"]

@@ -179,7 +179,8 @@ def pressure_shift(
 
 
 def _solve_symmetric_3(matrix: Expression, right: Expression) -> Expression:
-    """Solve a symmetric positive definite 3 by 3 system by its LDL^T factors."""
+    """Solve a linear system with a symmetric positive definite matrix (3, 3) and a right side (3,),
+    by LDL^T factors."""
     d_1 = matrix[0, 0]
     l_21, l_31 = matrix[1, 0] / d_1, matrix[2, 0] / d_1
     d_2 = matrix[1, 1] - l_21 * matrix[1, 0]

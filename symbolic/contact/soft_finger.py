@@ -255,7 +255,8 @@ def _pressed(
     share, ahead = mu[1] / mu[0], mu[0] * beyond
 
     def other_grip_squared(bound: Expression) -> Expression:
-        """Compute the squared grip of the second pad [N^2] from mu N of the first [N]."""
+        """Compute the squared grip of the pad that slips second [N^2] from `bound`, mu N of the pad
+        that slips first [N]."""
         return ca.fmax((share * (bound + ahead)) ** 2 - squared[1], 0.0) + FORCE_FLOOR**2
 
     def newton(grip: Expression) -> Expression:

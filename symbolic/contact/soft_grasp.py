@@ -128,7 +128,8 @@ class SoftGrasp:
         return ca.Function("slopes", inputs, ca.cse([ca.densify(value) for value in outputs]))
 
     def _newton(self) -> ca.Function:
-        """Build the function of one Newton step of a state at a fixed load."""
+        """Build the function of one Newton step of the states (size,) of all patches, at an
+        unchanged load."""
         state = ca.SX.sym("state", self.size)
         local = _Local(self, state)
         inputs = [state, *self.grasp.given.values()]

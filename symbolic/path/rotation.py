@@ -73,7 +73,8 @@ Quaternion = tuple[Expression, Expression]
 
 
 def _quaternion(v: Expression) -> Quaternion:
-    """Compute the unit quaternion of a rotation vector."""
+    """Compute the unit quaternion (real part, vector part (3,)) of a rotation vector `v` (3,)
+    [rad]."""
     square = ca.sumsqr(v)
     return _series(_COSINE, square), _series(_SINE, square) * v
 
@@ -112,12 +113,14 @@ def _series(coefficients: Sequence[float], x: Expression) -> Expression:
 
 
 def _turned(w: Expression, u: Expression, w_rate: Expression, u_rate: Expression) -> Expression:
-    """Compute the vector part (3,) of 2 q' q* of a quaternion q = (w, u)."""
+    """Compute the vector part (3,) of 2 q' q* for a quaternion q with real part `w`, vector part
+    `u` (3,), and their time derivatives."""
     return 2.0 * (w * u_rate - w_rate * u + ca.cross(u, u_rate))
 
 
 def _matrix_of(w: Expression, u: Expression) -> Expression:
-    """Compute the rotation (3, 3) of a unit quaternion."""
+    """Compute the rotation matrix (3, 3) of a unit quaternion with real part `w` and vector part
+    `u` (3,)."""
     across = ca.skew(u)
     return type(w).eye(3) + 2.0 * (w * across + ca.mtimes(across, across))
 

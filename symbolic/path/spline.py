@@ -42,7 +42,8 @@ class PathBasis:
 
 
 def path_basis(n_waypoints: int, parameter: Array) -> PathBasis:
-    """Compute the basis matrices of the natural quintic spline at the given parameters.
+    """Compute the matrices from waypoints to the natural quintic spline and its derivatives at n
+    values of u.
 
     Args:
         n_waypoints: number of waypoints, at least 2; two make a straight line.

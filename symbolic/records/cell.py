@@ -148,19 +148,19 @@ SIGNAL = text_pattern(
 
 @dataclass(frozen=True)
 class Driver:
-    """Connection to an arm's controller, and the abilities of the controller.
+    """Connection to an arm's controller, and what the controller can do.
 
     Attributes:
         address: host name or IP address; '' if unknown.
         prefix: prefix of the arm's joint names in its driver; None for the robot's name.
-        rate: cycle rate of the driver [Hz]; None for the target's default.
+        rate: cycle rate of the driver [Hz]; None for the default of the bundle's target.
         lag: delay of the arm behind its command [s].
         force_control: True if the controller has its maker's optional force control: a sensor at
             the flange, and instructions that press with a force.
         stiffness: stiffness of the controlled arm at the pad, along the pad's normal [N/m]; None if
             not measured.
-        grip_output: name of the output that switches the hands of the arm; '' for none.
-        grip_input: name of the input that is on while the hands hold; '' for none.
+        grip_output: name of the output signal that switches the arm's hands; '' for none.
+        grip_input: name of the input signal that is on while the hands hold; '' for none.
     """
 
     address: Annotated[str, ADDRESS] = ""
@@ -183,16 +183,18 @@ class Robot:
         package_dirs: folders in which `package://` addresses of the URDF are looked up: folders of
             the workcell file, then needed folders of ROS and of the Python environment.
         flange: name of the URDF frame on which the tool is mounted.
-        locked_joints: joints of the URDF held at a fixed position [rad or m].
-        T_world_base: (4, 4) root of the URDF in the world.
+        locked_joints: names and fixed positions [rad or m] of joints of the URDF that do not move.
+        T_world_base: (4, 4) root frame of the URDF in the world.
         T_flange_pad: (4, 4) pad frame in the flange frame.
         tool: collision bodies of the tool, in the flange frame.
-        position_lower, position_upper: (n,) joint limits [rad, or m for a sliding joint].
-        velocity_max: (n,) [rad/s].
-        acceleration_max: (n,) [rad/s^2].
-        torque_max: (n,) [N m, or N for a sliding joint]; infinite if unknown.
-        min_manipulability: least allowed |det J| of the flange-pad Jacobian of the six joints that
-            follow the box [m^3].
+        position_lower, position_upper: (n,) limits of the joint positions [rad, or m for a sliding
+            joint].
+        velocity_max: (n,) limits of the joint speeds [rad/s, or m/s].
+        acceleration_max: (n,) limits of the joint accelerations [rad/s^2, or m/s^2].
+        torque_max: (n,) limits of the joint torques [N m, or N for a sliding joint]; infinite if
+            unknown.
+        min_manipulability: least allowed absolute determinant of the Jacobian of the six joints
+            that follow the box [m^3].
         xacro_arguments: names and values of the xacro file's arguments.
         srdf: SRDF file; pairs of links that it disables are not checked for collision.
         chain_root: link of the URDF at which the arm begins; it ends at the flange. '' if every
@@ -202,7 +204,7 @@ class Robot:
         tool_load: mass and inertia of the tool; None if unknown.
         redundant_joints: names of the joints beyond six, whose paths are part of the decision
             vector; () for an arm with six joints.
-        jerk_max: (n,) [rad/s^3]; None for no limits.
+        jerk_max: (n,) limits of the joint jerks [rad/s^3, or m/s^3]; None for no limits.
         driver: connection to the arm's controller, for bundles.
     """
 
@@ -308,7 +310,7 @@ class Contact:
 
     @property
     def is_ring(self) -> bool:
-        """True if the patch presses only along its rim."""
+        """True if the patch presses only along its rim, as a cup's lip."""
         return self.kind == "cup"
 
     @property
@@ -413,7 +415,7 @@ class Uncertainty:
         return replace(self, **ranges)
 
     def restrict_to(self, names: Iterable[str]) -> Uncertainty:
-        """Return the uncertainty with only the named ranges; the others are zero."""
+        """Return the uncertainty with the ranges `names` unchanged and all other ranges zero."""
         none = Uncertainty()
         others = {name: getattr(none, name) for name in RANGES if name not in names}
         return replace(self, **others)
@@ -500,7 +502,8 @@ class Handling:
 
     @property
     def speed_max(self) -> float:
-        """Largest speed of the box at which `partner_stop` is satisfied [m/s]."""
+        """Largest speed of the box at which the pads move apart by at most `partner_stop` [m/s];
+        infinite without that limit."""
         return np.inf if self.partner_stop is None else self.partner_stop / PARTNER_TIME
 
 
@@ -579,8 +582,8 @@ class CollisionSettings:
     """Settings of collision checking.
 
     Attributes:
-        tolerance: bodies closer than this count as colliding [m].
-        ignored: pairs left out by the user.
+        tolerance: distance below which two bodies count as colliding [m].
+        ignored: pairs of bodies that the user left out of the check.
         most_pieces: largest accepted number of convex pieces of all bodies together.
     """
 
@@ -598,11 +601,11 @@ class Workcell:
         robots: the two arms; robot i holds contact i.
         payload, contacts, task, environment, collision, uncertainty, handling: records of the parts
             of the cell.
-        start_branch: (2,) for each robot the index of the start branch among the ranked branches;
-            -1 for the best by the ranking; `SEARCHED_BRANCH` if all branches compete
-            (`hybrid_opt.branches`), until then the best by the ranking.
+        start_branch: for each robot the index of its start branch, counted from the best of the
+            ranking. -1 selects the best. `SEARCHED_BRANCH` lets all branches compete
+            (`hybrid_opt.branches`); until then the best is used.
         source: the file that the workcell was read from.
-        reading: state of the workcell when it was read from `source`.
+        reading: digests of the workcell when it was read from `source`; None if it was not read.
         text: content that was read in place of the file's content; None for the file's content.
     """
 
@@ -640,13 +643,13 @@ class Workcell:
 
     @cached_property
     def pad_distance(self) -> float:
-        """Distance of the contacts along the normal of contact 1 [m]."""
+        """Distance of the two contact points along the normal of contact 1 [m]."""
         first, second = (contact.T_box_pad[:3, 3] for contact in self.contacts)
         return abs(float((first - second) @ self.contacts[0].T_box_pad[:3, 2]))
 
     @cached_property
     def pad_offset(self) -> float:
-        """Lateral offset of the contacts, perpendicular to the normal of contact 1 [m]."""
+        """Distance of the two contact points perpendicular to the normal of contact 1 [m]."""
         first, second = (contact.T_box_pad[:3, 3] for contact in self.contacts)
         normal, apart = self.contacts[0].T_box_pad[:3, 2], first - second
         return float(np.linalg.norm(apart - (apart @ normal) * normal))

@@ -51,14 +51,14 @@ def digest_of_parts(value: Any, folder: Path = Path()) -> str:
 
 
 def _counted(part: bytes) -> bytes:
-    """Prefix a part with its length, so that neighbouring parts cannot be confused."""
+    """Return bytes with their length in front, so that neighbouring parts cannot be confused."""
     return len(part).to_bytes(8, "big") + part
 
 
 @cache
 def _kind(of: type) -> str:
-    """Return how values of a type are divided into parts. The result is cached, since it is needed
-    often."""
+    """Return the name of the rule by which `digest_of_parts` divides values of a type into parts.
+    The result is cached, since it is needed often."""
     if of in (str, int, bool, type(None)):
         return "plain"
     known = {tuple: "tuple", np.ndarray: "array", type: "type", ContentRecord: "content"}
@@ -92,7 +92,8 @@ def _array_head(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
 
 @cache
 def _record(kind: Hashable) -> tuple[bytes, tuple[str, ...]]:
-    """Return the prefix of a record's content, and the names of its fields that belong to it."""
+    """Return the bytes that begin a record's content, and the names of the record's fields that
+    belong to it."""
     own: Any = kind
     names = (each.name for each in fields(own))
     kept = tuple(name for name in names if name not in ("source", "reading", "text"))

@@ -14,7 +14,7 @@ from symbolic.array import Array
 
 
 def read_only(values: Any) -> Array:
-    """Return a read-only float64 copy of an array-like."""
+    """Return a read-only float64 copy of an array or of nested sequences of numbers."""
     array = np.array(values, dtype=np.float64)
     array.setflags(write=False)
     return array
@@ -85,8 +85,8 @@ def rotation_from_rpy(rpy: ArrayLike) -> Array:
 
 
 def rpy_from_rotation(rotation: Array) -> Array:
-    """Compute roll, pitch, yaw (3,) [rad] of a rotation (3, 3); roll is zero at a pitch of +-90
-    degrees."""
+    """Compute roll, pitch, yaw (3,) [rad] of a rotation matrix (3, 3), the inverse of
+    `rotation_from_rpy`. At a pitch of +-90 degrees roll is zero."""
     level = np.hypot(rotation[0, 0], rotation[1, 0])
     pitch = np.arctan2(-rotation[2, 0], level)
     if level < 1e-9:
@@ -96,8 +96,8 @@ def rpy_from_rotation(rotation: Array) -> Array:
 
 
 def rotation_from_vector(vector: ArrayLike) -> Array:
-    """Compute rotations exp(v) (..., 3, 3) of rotation vectors (..., 3) [rad] by Rodrigues'
-    formula."""
+    """Compute rotation matrices exp(v) (..., 3, 3) of rotation vectors v (..., 3) [rad] by
+    Rodrigues' formula."""
     v = np.asarray(vector, dtype=float)
     angle = np.linalg.norm(v, axis=-1)[..., None, None]
     across = np.cross(v[..., None, :], np.eye(3))

@@ -58,7 +58,8 @@ class Problems:
             self.uncounted += 1
 
     def clean(self, *prefixes: str) -> bool:
-        """Return True if no problem was found at, below or above any of these key paths."""
+        """Return True if no problem was found at any of the key paths `prefixes`, below one or
+        above one."""
         return not any(
             _is_within(path, prefix) or _is_within(prefix, path)
             for path, _ in self.found
@@ -107,10 +108,11 @@ def shown(value: Any) -> str:
 
 
 class _Short(reprlib.Repr):
-    """A `repr` that reads only as much of a value as a message can show."""
+    """Variant of `repr` that reads only as much of a value as a message can show."""
 
     def repr_int(self, x: int, level: int) -> str:
-        """Return an integer's digits, or its number of bits: Python refuses thousands of digits."""
+        """Return an integer's digits, or the number of its bits if it has 200 or more: Python
+        refuses to print thousands of digits."""
         return repr(x) if x.bit_length() < 200 else f"a number of {x.bit_length()} bits"
 
 

@@ -79,12 +79,15 @@ class RedundantJoint:
 
 @dataclass(frozen=True)
 class AllowedContact:
-    """Permission for the payload to touch a named environment body near fixed poses.
+    """Permission for the payload to touch a named body of the environment near fixed waypoints.
+
+    The permission holds near each fixed waypoint at which the payload touches the body, up to the
+    collision tolerance.
 
     Attributes:
-        body: name of the environment body.
-        departure: distance of the box centre from a fixed waypoint within which contact is allowed
-            [m], if the payload touches the body at this waypoint, up to the tolerance.
+        body: name of the body.
+        departure: largest distance of the box centre from the fixed waypoint at which contact is
+            allowed [m].
     """
 
     body: Label
@@ -96,20 +99,20 @@ class Task:
     """The box path to plan, its sampling, and the settings of forces and time.
 
     Attributes:
-        waypoints: the ordered poses of the path; the first and last are fixed.
+        waypoints: poses of the path in order; the first and the last are fixed.
         samples: number of samples along the path, ends included.
         time_law: name of the time law (`symbolic.records.time_law`).
-        reference_speed: speed of the box centre, or cruise speed between ramps [m/s].
-        reference_angular_speed: angular speed for steps that mostly rotate [rad/s].
+        reference_speed: speed of the box centre, with ramps the speed between them [m/s].
+        reference_angular_speed: angular speed of steps that mostly rotate the box [rad/s].
         ramp_time: duration of each ramp, if the time law has ramps [s].
-        reference_force: (2,) force that normalises each robot's normal force [N].
-        initial: (n_free, 6) free waypoints of the hand-made trajectory.
-        allowed_contacts: contacts that do not count as collisions.
+        reference_force: (2,) force by which each robot's normal force is divided in objectives [N].
+        initial: (n_free, 6) free waypoints of the hand-made trajectory [m, rad].
+        allowed_contacts: contacts of the payload that do not count as collisions.
         allocation: name of the contact model (`symbolic.contact.registry`).
-        force_limit: (2,) bounds of the force limit, the last decision variable of drivable
-            carries [N].
+        force_limit: lower and upper bound of the force limit, the last decision variable of
+            drivable carries [N].
         redundant: joints whose paths are part of the decision vector.
-        orientation: meaning of the last three numbers of every pose.
+        orientation: convention of the last three numbers of every pose.
         pieces: number of pieces of the path between two waypoints of the file
             (`symbolic.path.pieces`).
     """

@@ -126,7 +126,7 @@ class PathConstraint(ABC):
     @property
     @abstractmethod
     def family(self) -> str:
-        """Name shared by the constraints that use the same functions."""
+        """Name of the constraint's family: the constraints that share its compiled functions."""
 
     @abstractmethod
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
@@ -173,7 +173,7 @@ class Clearance(PathConstraint):
 
     @property
     def family(self) -> str:
-        """Name of the family, which has this pair as its only member."""
+        """Name of the constraint's family, which contains only this pair of bodies."""
         return f"clearance_{self.column}"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
@@ -207,7 +207,7 @@ class JointLimit(PathConstraint):
 
     @property
     def family(self) -> str:
-        """Name of the family of all joint limits of one arm."""
+        """Name of the constraint's family: all joint limits of one arm."""
         return f"joint_limit_{self.arm + 1}"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
@@ -259,7 +259,7 @@ class ManipulabilityLimit(PathConstraint):
 
     @property
     def family(self) -> str:
-        """Name of the family, which has this arm as its only member."""
+        """Name of the constraint's family, which contains only this arm."""
         return f"reach_{self.arm + 1}"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
