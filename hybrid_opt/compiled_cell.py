@@ -218,8 +218,8 @@ class CompiledCell:
     def key(self, name: str, *details: str, bodies: bool = True) -> str:
         """Return the key under which a set of functions is cached.
 
-        The key depends on the topology of the cell and on the source code that makes the
-        expressions. The cache adds the version of CasADi.
+        The key depends on the topology of the cell, on the source code that makes the expressions,
+        and on the versions of Pinocchio and SciPy. The version of CasADi is added for every set.
 
         Args:
             name: name of the set.

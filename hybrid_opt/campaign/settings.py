@@ -50,7 +50,8 @@ def chosen(
         populations: pairs of algorithm and candidates per generation, each algorithm at most once.
 
     Raises:
-        SettingsError: a name is missing, unknown or given twice.
+        SettingsError: `names` is empty or has a name twice, or `populations` has an algorithm twice
+            or one that is not in `names`.
     """
     if not names or len(set(names)) != len(names):
         raise SettingsError(
@@ -142,7 +143,15 @@ class StoredCell:
 
 @dataclass(frozen=True)
 class Configuration:
-    """Content of configuration.json: everything that determines the results of a campaign."""
+    """Content of configuration.json: everything that determines the results of a campaign.
+
+    Attributes:
+        format: name of the file format.
+        version: version of the file format.
+        workcell: identity of the workcell.
+        settings: settings of the campaign.
+        environment: versions of the software that affects a search, by name.
+    """
 
     format: str
     version: int

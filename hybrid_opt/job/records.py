@@ -225,7 +225,7 @@ class Job(Displayable):
 
 @dataclass(frozen=True, eq=False)
 class SampledJob:
-    """A job at n evenly spaced samples, world frame, read-only.
+    """A job at n samples, evenly spaced within each phase, world frame, read-only.
 
     Joint arrays have the columns of both arms, the first arm's first. The last sample of a phase is
     also the first sample of the next phase.

@@ -72,6 +72,8 @@ def without_jumps(
     """Compute a timing of the same path without jumps of the acceleration, within the limits of the
     given timing. Jobs need such a timing.
 
+    A timing that begins and ends without acceleration is returned unchanged.
+
     Args:
         model: timing model of the workcell.
         timing: drivable timing with path speeds on the grid.

@@ -119,7 +119,7 @@ def wished_cell(cell: Cell, wish: Wish) -> Cell:
 
     Raises:
         SettingsError: robots and pads cannot hold the payload still.
-        WorkcellError: the cell with these values is wrong.
+        WorkcellError: the cell with these values is invalid.
     """
     known, changes = cell.workcell, dict[str, Any]()
     if wish.payload is not None and wish.payload != known.payload.mass:

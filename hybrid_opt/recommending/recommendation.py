@@ -85,16 +85,18 @@ class Recommendation(Displayable):
         force_kind: kind of force, planned or robust, that the force limit bounds.
         limited_force: (2,) largest force of this kind that each robot exerts along the carry [N].
         commanded: (2,) largest commanded normal force of each robot [N].
-        squeeze: how the commanded forces came about, with their contributions.
+        squeeze: record of how the commanded forces were computed, with their contributions.
         job: the whole job around the carry; None if no job can be planned.
-        margins: largest errors of the cell's description at which the commanded force holds.
+        margins: for each quantity of the cell, how far it may be off before the commanded force no
+            longer holds the box.
         rivals: other paths, such as the hand-made one, at the same force or duration.
         advice: effects of changes of the cell on force and duration.
         warnings: objections to the carry, as sentences.
-        required: (2,) largest force of each robot in any case of the uncertainty [N].
+        required: (2,) largest normal force that each robot needs in any case of the uncertainty
+            [N].
         budget: grip budget of the box at rest.
-        remedies: smallest changes of the cell that bring the required forces within the reference
-            forces; empty if they already are.
+        remedies: smallest changes of the cell that bring `required` within the reference forces;
+            empty if no change is necessary.
         reserve: largest mass and least friction with which the required forces stay within the
             reference forces.
         why: reason of the choice, as a text.
@@ -377,7 +379,7 @@ def _objections(found: CommandedForces) -> list[str]:
 
 
 def is_within(required: Array, allowed: Array) -> bool:
-    """Return True if required forces (2,) [N] exceed allowed forces (2,) [N] by at most the
+    """Return True if required forces (2,) [N] stay within allowed forces (2,) [N], up to the
     relative tolerance `BETTER`.
     """
     return bool((required <= allowed * (1.0 + BETTER)).all())

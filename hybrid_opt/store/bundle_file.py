@@ -1,4 +1,6 @@
-"""A bundle as files: written in one step with digests in its manifest, read without trust."""
+"""A bundle as a folder of files, written in one step. Its manifest holds the digests of all files
+and its own digest, which is checked when it is read.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-"""Files of results: written atomically, frozen records as JSON, checked once when they are read.
+"""Files of results: atomic writes, and records that are stored as JSON and checked when they are
+read.
 
-The annotations of a record's fields say what is allowed, see `symbolic.read.tables`.
+The annotations of a record's fields state the allowed values, see `symbolic.read.tables`.
 """
 
 from __future__ import annotations

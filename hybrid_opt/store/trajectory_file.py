@@ -1,9 +1,9 @@
-"""Trajectory stored as one self-contained JSON file, and its re-evaluation.
+"""A trajectory stored as one self-contained JSON file, and its re-evaluation.
 docs/reference/bundles.md describes the format.
 
-The file holds the decision vector, the start postures, the figures it was reported with, how it
-came about, and the whole workcell with every file that the workcell names. Reading it executes
-nothing and trusts nothing: every field is checked.
+The file holds the decision vector, the start postures, the figures of the carry, its origin, and
+the whole workcell with every file that the workcell names. Reading it executes nothing and checks
+every field.
 """
 
 from __future__ import annotations
@@ -118,11 +118,11 @@ def write_trajectory(
 
     Args:
         path: the file to write; its folder has to exist.
-        cell: the workcell, unchanged since reading, or the compiled cell. A compiled cell saves
-            time if several trajectories are stored.
+        cell: the workcell, unchanged since it was read, or its compiled cell, which saves time if
+            several trajectories are stored.
         x: (n_var,) decision vector.
-        figures: finite numbers by name, as from `Carry.figures`.
-        provenance: JSON values: algorithm, seed, versions and other origins.
+        figures: finite numbers by name that describe the carry, as from `Carry.figures`.
+        provenance: origin of the trajectory as JSON values: algorithm, seed, versions and others.
 
     Raises:
         ResultsError: the workcell was changed after reading, or a value cannot be stored.
