@@ -101,7 +101,10 @@ def read_sweep(file: Path) -> Sweep:
 
 
 def require_keys(cell: Cell, over: Mapping[str, Sequence[float]]) -> None:
-    """Check before any work that a cell has the keys of a sweep.
+    """Check, before any work, that a cell has the keys of a sweep.
+
+    Args:
+        over: values of each key that are combined.
 
     Raises:
         SettingsError: there are no values.
@@ -227,7 +230,7 @@ class _Request:
         cell: the unchanged cell.
         x: (n_var,) decision vector of a good carry of the unchanged cell.
         fixed: True if the path is kept.
-        keys: keys of the changed numbers.
+        keys: keys whose values are changed.
     """
 
     cell: Cell

@@ -525,7 +525,7 @@ class Workbench:
         self._pose()
 
     def _draw(self, verdict: SessionVerdict) -> None:
-        """Redraw the meshes of bodies that are new, or changed in shape or pose."""
+        """Redraw the meshes of bodies that are new, or whose shape or pose has changed."""
         assert verdict.cell is not None
         self._geometry = verdict.cell.geometry
         scene = self._server.scene
@@ -544,7 +544,7 @@ class Workbench:
             self._solids[solid.name] = (solid, mesh)
 
     def _pose(self) -> None:
-        """Place all moving bodies as at the selected sample."""
+        """Place all moving bodies on the page as at the selected sample of the carry."""
         carry = self.session.verdict.carry
         if carry is None:
             return

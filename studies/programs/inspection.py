@@ -357,14 +357,13 @@ def draw(
     explained: Mapping[str, Explanation],
     output: Path,
 ) -> tuple[str, ...]:
-    """Draw the paper's Figures 4 and 5 into a folder, and the first collision of each carry that
-    fails.
+    """Draw the paper's Figures 4 and 5 and, for each carry that fails, its first collision.
 
     Args:
         cell: the cell.
         carries: carries by name; 'initial' is among them.
-        explained: first failure of each carry that fails, by name.
-        output: the folder.
+        explained: first failure of each carry that fails, by the name of the carry.
+        output: folder of the pictures.
 
     Returns:
         Names of the files.
@@ -393,8 +392,11 @@ def draw(
 
 
 def show(carry: Carry, why: Explanation | None, path: Path) -> str:
-    """Write the page that plays a carry. It begins at the first failure, with the colliding bodies
-    in red.
+    """Write a page that plays a carry from its first failure on, with colliding bodies in red.
+
+    Args:
+        why: the first failure; None for a feasible carry.
+        path: path of the page.
 
     Returns:
         Name of the file.

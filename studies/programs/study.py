@@ -333,8 +333,8 @@ def polish_settings(
 
     Args:
         options: options of the program.
-        usual: whether to polish if the options do not state it.
-        is_drivable: whether the fronts are of a drivable cell.
+        usual: True to polish unless the options forbid it.
+        is_drivable: True if the fronts are of a drivable cell.
 
     Raises:
         SettingsError: a value is not allowed.

@@ -106,8 +106,8 @@ class StoredRecommendation:
             chosen.
         order: words before the force in texts, such as 'press with'.
         target: name of the export's target in the command that the study prints.
-        payload_limit: largest mass that the robots can carry on the same motion within the
-            reference forces, by planned forces [kg].
+        payload_limit: payload mass at which the total contact force of a robot reaches its
+            reference force, on the same motion and without uncertainty [kg].
         rivals: other paths, the hand-made one first: their durations at the same force, and their
             forces in the same time.
         margins: largest errors of single values of the cell's description that `force` tolerates.

@@ -153,8 +153,8 @@ class ReplicaFigures(FrontFigures):
 
 @dataclass(frozen=True)
 class PolishedStatistics:
-    """Statistics over the replicas of an algorithm's polished fronts: of their figures by name and
-    of the gain in hypervolume, and the number of replicas that gained."""
+    """Statistics of an algorithm's polished fronts over its replicas: of each figure by name, of
+    the gain in hypervolume by the polish, and the number of replicas with a gain."""
 
     statistics: Mapping[str, Summary]
     hypervolume_gain: Summary

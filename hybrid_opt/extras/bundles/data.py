@@ -128,15 +128,15 @@ def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, s
         return types[f"{package}/msg/{name}"](*values)
 
     def placed(kind: str, T: Array) -> tuple[Any, Any]:
-        """Build the position, as a message of the given kind, and the quaternion of a pose T (4,
-        4)."""
+        """Convert a pose T (4, 4) to a position, as a ROS message of the type `kind`, and a
+        quaternion message."""
         turn = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
         position = of(f"geometry_msgs/{kind}", *T[:3, 3].tolist())
         return position, of("geometry_msgs/Quaternion", *turn)
 
     def frames(k: int) -> Iterator[tuple[str, Array]]:
-        """Yield the name and pose (4, 4) in the world of the box, every link of both arms, and both
-        pads at sample k."""
+        """Yield name and pose (4, 4) in the world of each frame at sample k: the box, every link of
+        both arms, and both pads."""
         yield "box", boxes[k]
         for arm, robot in enumerate(cell.robots):
             model, found, prefix = models[arm], data[arm], joined[arm]

@@ -403,7 +403,7 @@ class Export:
         stiffness: stiffness of each arm at its pad along the normal [N/m]; None if nothing depends
             on it.
         gap: error of the pads between samples; None without a stiffness.
-        stop: the stop of the job along its path.
+        stop: shortest stop of both arms along the path.
     """
 
     sampled: SampledJob
@@ -428,7 +428,7 @@ class Export:
 
     @property
     def lag(self) -> float:
-        """Delay of the slower arm behind its command [s]."""
+        """Larger of both arms' delays behind their commands [s]."""
         return max(robot.driver.lag for robot in self.workcell.robots)
 
     @property

@@ -293,7 +293,7 @@ def target_for(name: str, workcell: Workcell) -> Target:
 
 
 def missing_for(name: str, workcell: Workcell, leader: int = 0) -> tuple[str, ...]:
-    """Return the data that a cell lacks for a target, as sentences, before any carry is known.
+    """Return sentences on what a cell lacks for a target, as far as this is known before any carry.
 
     Args:
         name: name of the target.
@@ -335,7 +335,7 @@ def missing_loads(workcell: Workcell) -> list[str]:
 
 
 def missing_text(name: str, workcell: Workcell) -> str:
-    """Format the data that a cell lacks for a target, for a terminal.
+    """Return the sentences of `missing_for` in a form for a terminal.
 
     Raises:
         SettingsError: the target is unknown.

@@ -134,8 +134,8 @@ def require_torque(job: Job) -> None:
 
 
 def joint_stiffness(job: Job) -> Array:
-    """Return the proportional gains (joints,) of all joints of both arms [N m/rad, for sliding
-    joints N/m]."""
+    """Return the proportional gains (joints,) of the joint controllers, both arms side by side [N
+    m/rad, for sliding joints N/m]."""
     largest = job.workcell.stack_joint_limits("torque_max")
     return np.minimum(GAIN * largest, FASTEST**2 * joint_inertia(job))
 
@@ -289,7 +289,7 @@ def joint_inertia(job: Job) -> Array:
 
 
 def _values(export: Export, arm: int) -> dict[str, Any]:
-    """Return the values of an arm that the templates of all drivers need."""
+    """Return those values for an arm's template that all drivers need, by name."""
     robot, prefix = export.workcell.robots[arm], prefixes(export.workcell)[arm]
     mass, centre = export.tool_load(arm)
     spaces = [prefix.rstrip("_") for prefix in prefixes(export.workcell)]
@@ -309,7 +309,8 @@ def _values(export: Export, arm: int) -> dict[str, Any]:
 
 
 def _franka(export: Export, arm: int) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Return the values of a Franka arm for its template, and the parameters of its broadcasters.
+    """Return the values for a Franka arm's template by name, and the parameters of its
+    broadcasters.
 
     Raises:
         SettingsError: a torque changes faster than libfranka accepts.
@@ -367,7 +368,7 @@ def _contact(job: Job, arm: int) -> tuple[Array, tuple[float, float]]:
 
 
 def _ur(export: Export, arm: int) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Return the values of a Universal Robots arm for its template, and the parameters of its
+    """Return the values for a Universal Robots arm's template by name, and the parameters of its
     broadcasters."""
     found = re.search(UR_TYPE, described(export.workcell.robots[arm]))
     values = _values(export, arm)

@@ -306,7 +306,7 @@ class ClosedChain:
         return found if len(found) == len(path) else None
 
     def _free(self, places: list[ChainConfiguration]) -> int:
-        """Return the number of free configurations before the first that collides."""
+        """Return the number of configurations `places` before the first one that collides."""
         if not places:
             return 0
         pose = np.array([place.extended[:POSE_SIZE] for place in places])

@@ -183,7 +183,7 @@ class Problem:
         return [pair for pair in pairs if pair != self.contacts]
 
     def _robots(self) -> tuple[Robot, Robot]:
-        """Both robots, read without the rest of the file."""
+        """Read both robots without the rest of the file."""
         problems = Problems()
         entries = TableReader(self.data, "", problems).tables("robots", exactly=2)
         found = [read_robot(entry, self.source.parent)[0] for entry in entries]
@@ -192,9 +192,13 @@ class Problem:
         return found[0], found[1]
 
     def sides(self) -> list[Problem]:
-        """Return copies of the problem with the pads on each pair of upright faces; on a machine
-        each pair twice, with exchanged arms. Only the problem itself if the file states the points,
-        or if a level carry past two robots determines the faces."""
+        """Return copies of the problem in which the file entries of the contacts place pads or
+        hands on different sides of the box.
+
+        Pads take each pair of opposite upright faces; on a machine each pair twice, with exchanged
+        arms. Hands take the best of `hand_places`. If the file states the points, or if a level
+        carry past two robots determines the faces, only the problem itself is returned.
+        """
         entries = self.data["contacts"]
         start, goal = self.poses
         if self.has_hands and not all("xyz" in entry for entry in entries):
@@ -248,6 +252,7 @@ class Problem:
 
         Args:
             changes: changes of the file's tables, as `symbolic.read.editing.completed` takes them.
+            folder: folder to which paths in the text are relative.
 
         Raises:
             SettingsError: the file is written in a way that cannot be edited.

@@ -175,18 +175,20 @@ class Proposal:
 
     @property
     def length(self) -> float:
-        """Euclidean length of the path of both arms' joints [rad]."""
+        """Euclidean length of the carry's path in the joint space of both arms [rad]."""
         return path_length(np.hstack(self.q))
 
     @property
     def passes(self) -> str:
-        """Text on the obstacles that the carry passes and the sides; 'nothing' if a straight motion
-        of the box meets only its support."""
+        """Text that names the obstacles and the sides on which the carry passes them; 'nothing' if
+        the box meets only its support on a straight motion."""
         return " and ".join(self.sides) or "nothing"
 
     def text(self, folder: Path) -> str:
-        """Return the text of the workcell file, with paths relative to a folder: the problem file
-        with the proposed values.
+        """Return the problem file with the proposed values filled in: the text of a workcell file.
+
+        Args:
+            folder: folder to which paths in the text are relative.
 
         Raises:
             SettingsError: the problem file is written in a way that cannot be edited.
@@ -229,7 +231,8 @@ def propose(
             runs out.
         settings: settings of the search; None for the defaults.
         tell: function that is called with a text on the current step.
-        progress: True for a bar, or a function of the seconds worked and the seconds allowed.
+        progress: True for a progress bar, or a function that is called with the seconds worked and
+            the seconds allowed.
 
     Raises:
         WorkcellError: the file is wrong.
@@ -247,18 +250,18 @@ def propose_classes(
     tell: Callable[[str], None] = lambda text: None,
     progress: ShowProgress = False,
 ) -> list[Proposal]:
-    """Propose complete workcells whose carries are of different classes, by increasing length of
-    the joint paths. Classes pass obstacles on different sides, or hold the box in other postures.
+    """Propose complete workcells for a problem file, with carries that pass obstacles on different
+    sides or hold the box in other postures. The one with the shortest joint paths comes first.
 
     Args:
         path: a problem file (docs/tutorials/two-robots.md).
         rng: generator of all random numbers. The same state gives the same proposals unless time
             runs out.
-        settings: settings of the search, with the number of classes; None for the defaults, one
-            class.
+        settings: settings of the search, with the number of carries in `classes`; None for the
+            defaults, one carry.
         tell: function that is called with a text on the current step.
-        progress: True for a bar, or a function of the seconds worked and the seconds allowed. Most
-            proposals need only a part of the allowed time.
+        progress: True for a progress bar, or a function that is called with the seconds worked and
+            the seconds allowed. Most proposals need only a part of the allowed time.
 
     Raises:
         WorkcellError: the file is wrong.
@@ -342,17 +345,15 @@ class _Search:
         return found
 
     def _takes_all(self, effort: int) -> bool:
-        """Return True if a round of the search tries every choice. Every choice of bases is tried;
-        other faces of the box only in late rounds, as long as the faces toward the robots can be
-        held.
-
-        Args:
-            effort: number of the round.
-        """
+        """Return True if a round in which a planner may check `effort` configurations tries every
+        choice. Every choice of bases is tried; other faces of the box only in late rounds, as long
+        as the faces toward the robots can be held."""
         return self.settings.bases or effort >= OTHER_FACES
 
     def _round(self, lazy: _Lazy, effort: int, most: int, strays: int) -> Iterator[Proposal]:
-        """Yield the proposals of one round with one choice of bases."""
+        """Yield the carries found in one round with one choice of bases. `effort` is the largest
+        number of configurations that a planner may check, `most` the number of pairs of holds, and
+        `strays` the number of `STRAYS`."""
         if lazy.setup is None and not lazy.problem:
             self._say("ways to hold the box")
             try:
@@ -384,7 +385,8 @@ class _Search:
                     yield from self._judged(lazy.setup, pair, via, box)
 
     def _is_known(self, pair: Pair, box: PayloadSceneChecker, path: Array) -> bool:
-        """Return True if a carry was found before whose class is that of the box poses (n, 6)."""
+        """Return True if a carry was found before with the same holds that passes the obstacles on
+        the same sides as a path of box poses (n, 6) [m, rad]."""
         return bool(self.known) and (id(pair), box.sides_passed(path)) in self.known
 
     def _failed(self, setups: list[_Lazy]) -> ProposalError:
@@ -406,8 +408,9 @@ class _Search:
         return ProposalError(text, code="out-of-time" if self.too_late else "no-path")
 
     def _remedies(self, spins: Array) -> str:
-        """Return a text on the least changes with which the box can be held, as far as the time
-        allows."""
+        """Return a text on the smallest changes of the cell with which both arms can hold the box;
+        '' if none are found in time. `spins` (n,) are the rotations of the pads that are tried
+        [rad]."""
         if self.settings.bases or not self.settings.remedies:
             return ""
         self._say("the least change with which the box can be held")
@@ -417,7 +420,8 @@ class _Search:
     def _paths(
         self, setup: Setup, pair: Pair, effort: int, strays: int, box: PayloadSceneChecker
     ) -> Iterator[list[ChainConfiguration] | None]:
-        """Yield the corners of paths with one pair of holds; None for a search without result."""
+        """Yield collision-free paths, each by its corners, with one pair of holds; None for a
+        search without result. `effort` and `strays` are those of the round."""
         if not effort:
             found = straight_paths(pair.chain, pair.retreats, box)
             yield from islice(found, None if self.settings.classes > 1 else 1)
@@ -440,8 +444,8 @@ class _Search:
             )
 
     def _via_points(self, pair: Pair, corners: list[ChainConfiguration]) -> Array | None:
-        """Find the fewest via-points for a path; None if no number of via-points gives a free
-        spline."""
+        """Find the smallest number of via-points (k, 6 + m) whose spline follows a path without
+        collision; None if there are none. A via-point is a box pose and the m redundant joints."""
         self._say("via-points")
         dense = remove_corners(pair.chain, corners, self.rng)
         for count in range(1, MOST_VIA_POINTS + 1):
@@ -453,8 +457,8 @@ class _Search:
     def _judged(
         self, setup: Setup, pair: Pair, via: Array, box: PayloadSceneChecker
     ) -> Iterator[Proposal]:
-        """Yield the proposal with these via-points, unless the evaluator refuses it or its class is
-        known."""
+        """Yield the proposal whose carry passes the via-points (k, 6 + m), unless the evaluator
+        refuses the carry or a carry of its class was found before."""
         fitted = np.vstack([pair.start.extended, via, pair.goal.extended])
         if self._is_known(pair, box, _poses(fitted)):
             return
@@ -508,7 +512,8 @@ class _Search:
     def _draft(
         self, setup: Setup, pair: Pair, waypoints: Array, bounds: Bounds | None = None
     ) -> Draft:
-        """Build the draft with waypoints (n, 6 + m), rounded as in a file."""
+        """Build the draft of the carry through waypoints (n, 6 + m), box poses with redundant
+        joints, rounded as in a file."""
         spins = (pair.holds[0].spin, pair.holds[1].spin)
         rounded = np.round(waypoints, 4)
         return Draft(setup.workcell, spins, (-1, -1), rounded, setup.given, bounds)
@@ -516,7 +521,8 @@ class _Search:
     def _trial(
         self, setup: Setup, pair: Pair, waypoints: Array, bodies: CellBodies | None = None
     ) -> Trial:
-        """Build the trial of the carry through waypoints (n, 6 + m)."""
+        """Build the evaluator of the carry through waypoints (n, 6 + m), box poses with redundant
+        joints."""
         workcell = self._workcell(self._draft(setup, pair, waypoints))
         bodies = bodies or build_cell_bodies(workcell, setup.bodies)
         return Trial(workcell, pair.start.q, bodies, named=False)

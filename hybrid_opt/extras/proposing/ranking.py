@@ -32,12 +32,12 @@ def rank_homotopy_classes(
     rng: np.random.Generator,
     tell: Callable[[str], None] = lambda text: None,
 ) -> tuple[list[Proposal], Table]:
-    """Rank proposals by the duration of the fastest carries of their classes. Return the sorted
-    proposals and a table.
+    """Sort proposals by the duration of the fastest carry that a search within each one's bounds
+    finds. Return them with a table of these durations.
 
     Args:
         proposals: proposals of different classes.
-        evaluations: number of evaluations of the search within each class.
+        evaluations: number of candidates of each search.
         rng: generator of all random numbers.
         tell: function that is called with a text on the current step.
     """

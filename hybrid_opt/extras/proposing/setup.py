@@ -382,8 +382,14 @@ def _arm_missing(kinematics: ArmKinematics, search: HoldSearch) -> str:
 
 
 def _no_pair(query: HoldQuery, judge: PoseJudge, searches: Sequence[HoldSearch]) -> str:
-    """Return a text on the arm that cannot hold the box, or on the bodies that collide although
-    either arm alone is free."""
+    """Return a text on why no pair of holds was found: an arm that cannot hold the box, or bodies
+    that collide although either arm alone is free.
+
+    Args:
+        query: box poses that the arms have to hold.
+        judge: checker of collisions.
+        searches: result of the search for each arm.
+    """
     told = [
         _arm_missing(ArmKinematics(judge.geometry.workcell, arm), one)
         for arm, one in enumerate(searches)

@@ -211,7 +211,7 @@ class PoseJudge:
         ]
 
     def with_margin(self, margin: float) -> PoseJudge:
-        """Return the checker with another clearance margin."""
+        """Return a checker of the same cell with another `margin` [m]."""
         workcell = self.geometry.workcell
         collision = workcell.collision
         wider = replace(collision, tolerance=collision.tolerance - self.margin + margin)
@@ -374,8 +374,8 @@ class Trial:
         return initial_decision(self.workcell.task)
 
     def start_of(self, x: Array) -> tuple[Array, Array]:
-        """Compute the postures (joints,) of both arms at the start of a decision vector x
-        (n_var,)."""
+        """Compute the posture (joints,) of each arm at the start of the carry of a decision vector
+        x (n_var,) [rad or m]."""
         outputs = self.evaluator.outputs(x[None])
         return outputs["q_1"][0, 0], outputs["q_2"][0, 0]
 
@@ -483,7 +483,7 @@ class BranchLostError(Exception):
 
 
 def _branch(branches: tuple[StartBranch, ...], q: Array) -> int:
-    """Return the index of the branch that equals a posture."""
+    """Return the index of the start branch that equals a posture q (joints,) up to full turns."""
     apart = [
         float(np.abs(np.remainder(branch.q - q + np.pi, 2.0 * np.pi) - np.pi).max())
         for branch in branches

@@ -169,8 +169,9 @@ class CellSimulation:
 
     Attributes:
         workcell, settings: the cell, and settings of the simulation.
-        mujoco, model, text: the simulator's module, its model of the cell, and the model as MJCF.
-        disturbance: (3,) additional acceleration of the box, world frame [m/s^2].
+        mujoco, model, text: MuJoCo's Python module, its model of the cell, and the model as MJCF.
+        disturbance: (3,) acceleration that the pads have to give the box in addition, world frame
+            [m/s^2].
     """
 
     def __init__(
@@ -381,8 +382,11 @@ class _ArmSimulation:
         return np.clip(torque, -self._limit, self._limit)
 
     def _joint_inertia(self) -> Array:
-        """Compute the inertia (all joints,) about each joint while the other joints are fixed [kg
-        m^2]."""
+        """Compute the inertia about each joint while all other joints are fixed.
+
+        Returns:
+            (all joints,) both arms side by side [kg m^2, for sliding joints kg].
+        """
         found = np.empty(len(self._v))
         for k, joint in enumerate(self._v):
             unit, moved = np.zeros(self._model.nv), np.zeros(self._model.nv)

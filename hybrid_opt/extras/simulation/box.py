@@ -110,15 +110,16 @@ class Threshold(Generic[AnyOutcome]):
 def bisected(
     simulate: Callable[[float], AnyOutcome], low: float, high: float, steps: int
 ) -> Threshold[AnyOutcome]:
-    """Find the least factor with which the box holds in a simulation, by bisection.
+    """Find the least factor with which the box holds in a simulation, by bisection between two
+    factors.
 
     Args:
-        simulate: function of a factor that returns its outcome.
-        low, high: factors at which the box slips, and at which it holds.
+        simulate: function that runs a simulation with a factor and returns its outcome.
+        low, high: a factor at which the box slips, and one at which it holds.
         steps: number of bisections.
 
     Raises:
-        SimulationError: the box holds at the lower or slips at the higher factor.
+        SimulationError: the box holds at `low` or slips at `high`.
     """
     slips, holds = simulate(low), simulate(high)
     if slips.holds or not holds.holds:

@@ -257,8 +257,12 @@ def compiled(mujoco: ModuleType, text: str, damping: float = LAYER_DAMPING) -> t
 
 
 def box_body(payload: Payload, geoms: str) -> str:
-    """Return the free body `box` with the payload's mass and inertia and the given geoms, as
-    MJCF."""
+    """Return the free body `box` as MJCF, with mass and inertia of the payload.
+
+    Args:
+        payload: the payload.
+        geoms: MJCF of its geoms.
+    """
     about = payload.inertia[[0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]]
     return f"""<body name="box">
       <freejoint name="box"/>
@@ -525,7 +529,7 @@ def cell_text(workcell: Workcell, settings: ArmSettings) -> str:
 
 
 def _ties(workcell: Workcell) -> Iterator[str]:
-    """Yield equality constraints between the two copies of each joint that moves both arms, as
+    """Yield MJCF constraints that keep the two copies of each joint that moves both arms equal, as
     stiff as the time step allows."""
     names = [tuple(arm_model(robot).names)[1:] for robot in workcell.robots]
     for name in common_joints(workcell.robots):
@@ -534,7 +538,12 @@ def _ties(workcell: Workcell) -> Iterator[str]:
 
 
 def _arm(workcell: Workcell, settings: ArmSettings, i: int, shown: dict[Frame, list[str]]) -> str:
-    """Return the nested bodies of one arm as MJCF, with its pad on the last."""
+    """Return the nested bodies of one arm as MJCF. The last one bears its pads.
+
+    Args:
+        i: index of the arm.
+        shown: MJCF geoms by frame.
+    """
     model, geometry = arm_model(workcell.robots[i]), arm_geometry(workcell, i)
     contact = workcell.contacts[i]
     # The pad stands at the nominal contact, wherever the box is displaced to.

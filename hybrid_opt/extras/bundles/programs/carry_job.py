@@ -140,8 +140,12 @@ class Job:
         return next((name for last, name in self._phases if s <= last), self._phases[-1][1])
 
     def begin(self, name: str) -> float:
-        """Return the coordinate at which the phase with this name begins [s]; the last coordinate
-        if the job has no such phase."""
+        """Return the coordinate at which a phase begins [s]; the last coordinate if the job has no
+        such phase.
+
+        Args:
+            name: name of the phase.
+        """
         first = 0.0
         for last, phase in self._phases:
             if phase == name:
@@ -187,7 +191,7 @@ class Job:
 
     @property
     def is_standing(self) -> bool:
-        """True if the box stood before the end of its set-down."""
+        """True if `stand` was called: the box stood before the end of its set-down."""
         return self._early is not None
 
     @cached_property

@@ -125,7 +125,7 @@ class Clock:
 
     @property
     def change(self) -> float:
-        """Derivative of the rate by time [1/s]."""
+        """Derivative of the rate with respect to time [1/s]."""
         if not self.turning:
             return 0.0
         x = self._share
@@ -258,8 +258,11 @@ class Machine:
         self.state, self.reason = "held", reason
 
     def resume(self, direction: float, seen: Seen) -> None:
-        """Continue after a stop: with direction 1 to the end of the job, with -1 back to its
-        beginning.
+        """Continue a job that is held.
+
+        Args:
+            direction: 1 to run to the end of the job, -1 to run back to its beginning.
+            seen: measured state of both arms.
 
         Raises:
             Refused: the job is not held, or an arm is silent or not where it is held.
@@ -305,7 +308,13 @@ class Machine:
         self.clock.keep(low, high)
 
     def _wait(self, dt: float, seen: Seen) -> None:
-        """Wait for hands where the clock has to, and continue as soon as all inputs agree."""
+        """Wait while the clock stands at a place where hands are switched, and continue when all
+        inputs report the commanded state.
+
+        Args:
+            dt: time since the last call [s].
+            seen: measured state of both arms.
+        """
         if self.clock.turning or self._gates[:1] != [self.clock.s]:
             return
         self._waited += dt
@@ -319,7 +328,13 @@ class Machine:
             self.hold(f"{self._grip(late[0], seen)} after {self.job.limits.grip:g} s")
 
     def tick(self, dt: float, seen: Seen) -> None:
-        """Advance the time by dt [s] and check the arms."""
+        """Advance the time by dt [s]. Stop or hold the job if the measured state of the arms
+        requires it.
+
+        Args:
+            dt: time since the last call [s].
+            seen: measured state of both arms.
+        """
         self.clock.advance(dt)
         self.opened = False
         limit = self.job.limits.silence
@@ -408,7 +423,7 @@ class Machine:
         return f"keep their hands switched {'on' if self.grip else 'off'}"
 
     def _grip(self, arm: int, seen: Seen) -> str:
-        """Return a text on the state that the input of an arm's hands reports."""
+        """Return a text that says what the input of an arm's hands reports."""
         if seen.grip[arm] is None:
             return f"nothing is heard of the input of {self._name(arm)}'s hands"
         return f"the hands of {self._name(arm)} {'hold' if seen.grip[arm] else 'do not hold'}"
@@ -428,7 +443,8 @@ class Machine:
                 )
 
     def _wrong(self, seen: Seen) -> str:
-        """Return the reason why the job cannot continue, '' if it can."""
+        """Return the reason why the measured state of the arms does not allow to continue, '' if it
+        does. The size of forces is checked by `_wrong_force` alone."""
         limits, s = self.job.limits, self.clock.s
         # Nothing is lifted, and no job done, by an arm that stands elsewhere.
         stands = self.job.is_gripped(s) or s in (0.0, self.job.end)

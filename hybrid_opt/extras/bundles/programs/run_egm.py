@@ -135,7 +135,8 @@ class Stream:
         Args:
             job: the job.
             config: settings of the bundle.
-            known: measured values of both arms, or a `Looks` that measures them.
+            known: measured properties of both arms; or a store of measurements, if the arms are to
+                be measured.
         """
         self.job, self.config = job, config
         self.looks = known if isinstance(known, Looks) else None
@@ -352,8 +353,8 @@ def streamed(
     """Answer both controllers until the job is done. Return the exit code.
 
     Args:
-        stream: answers the messages.
-        sockets: socket of each controller.
+        stream: the control of both arms.
+        sockets: UDP socket for each controller.
         check: True to check both arms without moving them.
         word: word that somebody has to type before the job begins.
 

@@ -98,7 +98,8 @@ def fill(message: Any, values: dict[str, Any]) -> None:
 
 
 class Run:
-    """A run of the job by both arms' controllers, as config/cell.json describes them."""
+    """A run of the job by the controllers of both arms, with ROS names and settings from
+    config/cell.json."""
 
     def __init__(
         self, node: Any, job: Job, config: dict[str, Any], known: Sequence[Measured] | Looks
@@ -109,7 +110,8 @@ class Run:
             node: ROS node.
             job: the job.
             config: content of config/cell.json.
-            known: measured values of both arms, or a `Looks` that measures them.
+            known: measured properties of both arms; or a store of measurements, if the arms are to
+                be measured.
         """
         self.node, self.config = node, config
         self.looks = known if isinstance(known, Looks) else None
@@ -229,7 +231,13 @@ class Run:
         )
 
     def _normal_force(self, arm: int, now: float) -> float | None:
-        """Return a pad's measured normal force [N]; None while the arms are being measured."""
+        """Return the measured normal force of an arm's pad [N]; None without a recent reading, or
+        while the arms are being measured.
+
+        Args:
+            arm: index of the arm.
+            now: time [s].
+        """
         raw = self._raw(arm, now)
         return None if raw is None or self._signs is None else self._signs[arm] * raw
 
@@ -432,7 +440,11 @@ class Run:
             self._resume(1.0 if self.command == "continue" else -1.0)
 
     def stop(self, reason: str) -> None:
-        """Stop the arms along the path for a reason that the caller states."""
+        """Stop both arms along the path.
+
+        Args:
+            reason: reason of the stop, for messages.
+        """
         if self.machine.state == "running":
             self.machine.stop(reason)
             self._stop()
@@ -452,8 +464,13 @@ class Run:
             self.node.get_logger().error(f"{error}; its arm goes on as it was last told")
 
     def drive(self, part: Job, word: str) -> bool:
-        """Drive a part of the job to its end and back, after somebody has typed a word. Return True
-        if it was done."""
+        """Run a part of the job to its end and back, after somebody has typed a word. Return True
+        if it was completed.
+
+        Args:
+            part: the part of the job.
+            word: the word.
+        """
         self.take(part)
         self.node.get_logger().info(BLOCK if word else AIR)
         while self.command != word and not self.fault:
