@@ -68,8 +68,8 @@ AnyExpression = TypeVar("AnyExpression", ca.SX, ca.MX)
 class ConvexProgram(Protocol):
     """Convex program: the contact wrenches of least cost that balance a load.
 
-    Each contact's wrench is scaled to N, T / mu, M / (mu r) as in `symbolic.contact.force_closure`.
-    The argument `cell` of every method lists the program's inputs in the order of `cell_sizes`.
+    Wrenches are scaled by friction and patch radius as in `symbolic.contact.force_closure`. The
+    argument `cell` of every method lists the program's inputs in the order of `cell_sizes`.
     """
 
     @property

@@ -49,7 +49,8 @@ slowly."""
 
 @dataclass(frozen=True)
 class EvenPatch(Patch):
-    """Contact patch under uniform pressure, with the state N, T / mu (2,), M / (mu r) of a pad.
+    """Contact patch under uniform pressure. Its state (4,) is N, T / mu (2,), M / (mu r): normal
+    force N, tangential force T, torsion M, friction coefficient mu, patch radius r.
 
     Attributes:
         shape: lengths of the patch over its radius, along the pad's axes.

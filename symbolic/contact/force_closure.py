@@ -74,11 +74,11 @@ selected before."""
 
 @dataclass(frozen=True)
 class InternalForce:
-    """Internal squeeze of a grasp: pad forces within the friction cones whose sum has no load.
+    """Internal squeeze of a grasp: pad forces within the friction cones that balance one another.
 
     Attributes:
-        states: for each pad its scaled state N, T / mu (2,), M / (mu r), at the nominal friction;
-            the normal forces N of all pads sum to one.
+        states: for each pad its scaled state (4,) at the nominal friction; the normal forces of all
+            pads sum to one.
         least_share: least share of the nominal friction coefficients with which an internal squeeze
             exists, at least `LEAST_SQUEEZE_SHARE`.
     """
@@ -145,8 +145,8 @@ def balance_maps(workcell: Workcell, in_units: bool = False) -> list[Array]:
 
     Args:
         workcell: cell with the pads.
-        in_units: True for states N, T (2,) [N], M [N m]; False for states scaled by friction and
-            patch radius.
+        in_units: True for states of normal force, tangential force (2,) [N] and torsion [N m];
+            False for states scaled by friction and patch radius.
     """
     alike, found = equal_pressure_rows(workcell), []
     for i, pad in enumerate(workcell.pads):
@@ -203,7 +203,11 @@ def _weights(columns: Array) -> Array | None:
 
 def state_to_box(contact: Contact) -> Array:
     """Return the matrix (6, 4) that maps a pad's scaled state to force [N] and moment [N m] about
-    the box frame's origin, along the box's axes."""
+    the box frame's origin, along the box's axes.
+
+    The state holds the normal force, the tangential force (2,) over the friction coefficient, and
+    the torsion over friction coefficient times patch radius [N].
+    """
     mu, r = contact.friction, contact.patch_radius
     local = np.zeros((WRENCH_SIZE, WRENCH_SIZE))
     local[[0, 1, 2], [1, 2, 0]] = mu, mu, 1.0
@@ -384,7 +388,8 @@ def robot_wrenches(workcell: Workcell) -> Array:
     and moments along the axes of contact 1.
 
     Each pad's moment is taken about the nominal contact point of the pad's own robot. A pad's
-    wrench has the entries N, T (2,), N d (2,), M along the pad's axes.
+    wrench holds, along the pad's axes, normal force, tangential force (2,), the normal force times
+    the shift (2,) of the centre of pressure, and torsion.
     """
     axes, columns = workcell.contacts[0].T_box_pad[:3, :3], []
     for pad, robot in zip(workcell.pads, workcell.pad_robots, strict=True):

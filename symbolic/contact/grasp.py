@@ -70,6 +70,9 @@ class Grasp:
     """Convex program of a workcell's pads, for any number of pads and any normals. Programs are
     equal only to themselves.
 
+    The scaled wrench (4,) of a pad, also called its state, is N, T / mu (2,), M / (mu r): normal
+    force N, tangential force T, torsion M, friction coefficient mu, patch radius r.
+
     Attributes:
         robots: index of the robot of each pad.
         patches: barrier functions of the pads, as in `ConvexProgram`.
@@ -147,8 +150,8 @@ class Grasp:
         internal squeeze is added until the states lie within the cones.
 
         Args:
-            cell: inputs: scaled load (6,), friction (2,), and relative patch sizes (2,) if the
-                program has this input.
+            cell: inputs of the program: load (6,) divided by its size, friction (2,), and relative
+                patch sizes (2,) if the program has this input.
 
         Returns:
             State (4,) of each pad, in balance with the load; and the weight of the barriers, times
@@ -227,22 +230,27 @@ class Grasp:
         return self._at(ca.SX(number(self.numbers.squeeze)), friction, reach)
 
     def squeeze_normals(self) -> Array:
-        """Compute the sum of the normal forces of each robot (2,) in the internal squeeze of unit
-        size. The grasp must have no symbolic parameters."""
+        """Compute the sum of the normal forces of each robot (2,) in the internal squeeze: pad
+        forces that balance one another, scaled so that all normal forces sum to one. The grasp must
+        have no symbolic parameters."""
         return np.array(ca.evalf(self.normals)).ravel()
 
     @property
     def normals(self) -> ca.SX:
-        """Sum of the normal forces of each robot (2,) in the internal squeeze of unit size, as an
-        expression."""
+        """Sum of the normal forces of each robot (2,) in the internal squeeze, as an expression.
+        The normal forces of both robots sum to one."""
         squeeze, found = number(self.numbers.squeeze), ca.SX(2, 1)
         for at, robot in zip(self._ends, self.robots, strict=False):
             found[robot] += squeeze[at]
         return found
 
     def squeeze_wrenches(self) -> Array:
-        """Compute the wrenches (k, 6) of all k pads in the internal squeeze of unit size: N, T
-        (2,), N d (2,), M along each pad's axes. The grasp must have no symbolic parameters."""
+        """Compute the wrenches (k, 6) of all k pads in the internal squeeze, whose normal forces
+        sum to one. The grasp must have no symbolic parameters.
+
+        A wrench holds normal force, tangential force (2,), the normal force times the shift (2,) of
+        the centre of pressure, and torsion, along the pad's axes.
+        """
         states = ca.vertsplit(ca.SX(number(self.numbers.squeeze)), self._ends)
         parts = [
             full_wrench(self.units(i, self.friction) * state) for i, state in enumerate(states)
@@ -252,9 +260,9 @@ class Grasp:
     def solve(
         self, cell: list[ca.MX], given: Sequence[ca.MX], differentiable: bool = False
     ) -> ca.MX:
-        """Build the expression of the wrenches of least effort, (6 k,) for k pads: N, T (2,) [N], N
-        d (2,), M [N m] of each pad along its axes. Normal forces exceed any limit if friction does
-        not close the grasp.
+        """Build the expression of the pad wrenches of least effort, (6 k,) for k pads, with entries
+        as in `grasp_wrenches` [N, N m]. Normal forces exceed any limit if friction does not close
+        the grasp.
 
         Args:
             cell: the program's inputs; the first is the load (6,) about the box frame's origin,
@@ -338,8 +346,9 @@ def grasp_wrenches(
     """Build the expression of the pad wrenches of least effort, (6 k,) for k pads one after the
     other.
 
-    A wrench has the entries N, T (2,) [N], the first moment of the pressure N d (2,) and M [N m],
-    along the pad's axes. Normal forces exceed any limit if friction does not close the grasp.
+    A wrench holds, along the pad's axes, normal force and tangential force (2,) [N], the normal
+    force times the shift (2,) of the centre of pressure, and torsion [N m]. Normal forces exceed
+    any limit if friction does not close the grasp.
 
     Args:
         grasp: program of the pads.
@@ -351,8 +360,13 @@ def grasp_wrenches(
 
 
 def full_wrench(wrench: ca.SX) -> ca.SX:
-    """Return all six entries N, T (2,), N d (2,), M of a pad's wrench from the four entries N, T
-    (2,), M that it bears; N d is zero. One column per wrench."""
+    """Return all six entries of a pad's wrench, with zero for the two moments that an evenly
+    pressing pad cannot bear.
+
+    Args:
+        wrench: (4, n) normal force, tangential force (2,) and torsion of n wrenches, one per
+            column.
+    """
     whole = ca.SX(WRENCH_SIZE, wrench.shape[1])
     whole[list(EVEN), :] = wrench
     return ca.densify(whole)

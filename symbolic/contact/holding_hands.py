@@ -100,7 +100,8 @@ def required_holding_forces(
 
     Args:
         wrench: (6,) wrench of the hand on the payload about the hand's origin, along the hand's
-            axes: T (2,), N [N], M_x, M_y, tau [N m].
+            axes: tangential force (2,), normal force [N], moments about the two tangents, torsion
+            [N m].
         friction: Coulomb coefficient of the hand.
         patch: patch of the hand.
     """
@@ -129,8 +130,8 @@ def internal_force_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Arra
         robots: index of the arm of each hand.
 
     Returns:
-        (n, 3) numbers a, b, c for each hand, dimensionless: a / mu + b is the additional holding
-        force against sliding, with friction mu, and c the one against lifting off.
+        (n, 3) dimensionless numbers a, b, c for each hand. Against sliding the additional holding
+        force is a / mu + b, with the friction coefficient mu; against lifting off it is c.
     """
     maps, stiff = [wrench_to_box(pad) for pad in pads], [layer_stiffness(pad) for pad in pads]
     wholes = [np.zeros((6, 6)), np.zeros((6, 6))]
@@ -154,9 +155,10 @@ class HoldingHands(ContactModel):
     """Contact model of hands (cups, magnets, grippers) on both arms, of any number and with any
     normals.
 
-    The normal force of an arm is the largest holding force that any of the arm's hands needs, as a
-    share of the hand's own holding force, times the least holding force of all hands. No force is
-    commanded. In worst cases, one force limit applies to the hands of both arms together.
+    Here the normal force of an arm stands for a holding force: each hand's least holding force,
+    times the ratio of the weakest hand's own force to the hand's own force; the largest of the
+    arm's hands counts. No force is commanded. In worst cases, one force limit applies to the hands
+    of both arms together.
     """
 
     assumption = "hands that hold by themselves, on arms that keep their poses"
@@ -323,12 +325,12 @@ class HoldingHands(ContactModel):
         return np.full(commanded.shape, weakest)
 
     def raised(self, planned: Array, extra: Array, leader: int) -> Array:
-        """Return the holding force of arm `1 - leader` raised by `extra`, once for each arm, (n, 2)
-        [N].
+        """Compute the holding forces (n, 2) [N] after a rise; the hands of both arms get the same
+        force.
 
         Args:
             planned: (n, 2) planned holding forces [N].
-            extra: (n,) rise of the force [N].
+            extra: (n,) rise of the force of the robot that does not lead [N].
             leader: index of the leading robot.
         """
         return np.repeat((planned[:, 1 - leader] + extra)[:, None], 2, axis=1)

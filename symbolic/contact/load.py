@@ -251,8 +251,8 @@ def box_load_function(workcell: Workcell) -> ca.Function:
 def grasp_world_function(workcell: Workcell) -> ca.Function:
     """Build the function that converts the wrenches of k pads to `GRASP_OUTPUTS` in world axes.
 
-    Inputs: pose, force, moment and centre_of_mass as in `box_load_function`; wrenches (6 k,), N, T
-    (2,), N d (2,), M of each pad along its axes [N, N m]; then the payload's symbolic parameters.
+    Inputs: pose, force, moment and centre_of_mass as in `box_load_function`; wrenches (6 k,) with
+    entries as in `symbolic.contact.grasp.grasp_wrenches`; then the payload's symbolic parameters.
     """
     pose, _, moment, centre_of_mass = inputs = [ca.SX.sym(*entry) for entry in _ASKED]
     pads, robots = workcell.pads, workcell.pad_robots

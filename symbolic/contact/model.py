@@ -302,9 +302,9 @@ class ContactModel(ABC):
         robot rises.
 
         Args:
-            planned: (n, 2) planned normal forces [N].
+            planned: (n, 2) planned normal forces of the robots [N].
             extra: (n,) rise of the force-controlled robot's force [N].
-            leader: index of the leading robot; the other one is force-controlled.
+            leader: index of the leading robot; the other robot is force-controlled.
         """
         return planned + np.multiply.outer(extra, self.internal_force_ratio(leader))
 

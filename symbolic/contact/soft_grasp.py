@@ -85,7 +85,10 @@ class SoftGrasp:
 
     def wrenches(self, slopes: bool) -> ca.Function:
         """Build the function from the states (size,) of all patches to the wrenches (6 k,) of the k
-        pads: N, T (2,) [N], N d (2,), M [N m] of each pad along its axes.
+        pads.
+
+        A wrench holds, along the pad's axes, normal force and tangential force (2,) [N], the normal
+        force times the shift (2,) of the centre of pressure, and torsion [N m].
 
         Args:
             slopes: True for a second output, the derivatives (6 k, 6) of the wrenches by the load.
