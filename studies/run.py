@@ -231,7 +231,7 @@ def study_of(workcell: Path, options: argparse.Namespace, with_paper: bool = Fal
     Args:
         workcell: path of the workcell file.
         options: options that were parsed with those of `add_options`.
-        with_paper: whether tables have rows with the values that the paper states.
+        with_paper: True to add rows to tables with the paper's values.
     """
     again = [part for part in options.arguments if part not in ("--resume", "--overwrite")]
     command = " ".join([options.called, shlex.join([*again, "--resume"])])

@@ -106,7 +106,7 @@ class AlgorithmRuns:
 
     @property
     def shown(self) -> ReportRun:
-        """The replica with the largest hypervolume."""
+        """The replica with the largest hypervolume, which pictures of single runs show."""
         return self.runs[self.representative]
 
 

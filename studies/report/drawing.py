@@ -190,7 +190,12 @@ def limit_line(axes: Axes, level: float, label: str, across: bool = True) -> Non
 
 
 def rest_line(axes: Axes, level: float, label: str) -> None:
-    """Draw the force of the payload at rest as a horizontal line at y = `level`."""
+    """Draw a normal force of the payload at rest as a horizontal line.
+
+    Args:
+        level: the force on the vertical axis.
+        label: name in the legend.
+    """
     axes.axhline(level, color="black", linewidth=0.8, linestyle=(0, (7, 2, 1, 2)), label=label)
 
 
@@ -205,7 +210,8 @@ def panel_label(axes: Axes, letter: str, text: str, bare: bool = False) -> None:
 
 
 def files_of(figure: Figure, pdf: bool = True) -> dict[str, bytes]:
-    """Return the contents of a settled figure's files by suffix: 'png', and 'pdf' if wanted."""
+    """Return the contents of the files of a figure with fixed layout by suffix: 'png', and 'pdf' if
+    wanted."""
     wanted = {"png": {"Software": None}} | ({"pdf": {"CreationDate": None}} if pdf else {})
     files = {}
     with in_style():
@@ -217,7 +223,11 @@ def files_of(figure: Figure, pdf: bool = True) -> dict[str, bytes]:
 
 
 def save(figure: Figure, folder: Path, name: str, pdf: bool = True) -> tuple[Path, ...]:
-    """Write a settled figure as PNG, and as PDF if wanted, to `folder`; return the paths."""
+    """Write a figure with fixed layout to a folder as PNG, and as PDF if wanted. Return the paths.
+
+    Args:
+        name: name of the files, without suffix.
+    """
     paths = []
     for suffix, content in files_of(figure, pdf).items():
         paths.append(folder / f"{name}.{suffix}")
@@ -281,7 +291,7 @@ class View:
 
     @property
     def towards(self) -> Array:
-        """(3,) unit vector from the scene to the viewer, in the world frame."""
+        """(3,) unit vector in the world frame from the scene to the viewer."""
         return np.cross(self.right, self.up)
 
     def flat(self, points: Array) -> Array:

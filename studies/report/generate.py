@@ -154,9 +154,9 @@ def make_report(
 
     Args:
         root: the results folder.
-        settings: arguments `with_paper` and `pdf` of `write_report` by name, and `paper`: whether
-            the paper's pictures are drawn.
-        progress: shows the progress.
+        settings: by name the arguments `with_paper` and `pdf` of `write_report`, and `paper`, True
+            to draw the paper's pictures.
+        progress: display of the progress.
         workers: processes that draw.
 
     Raises:
@@ -180,10 +180,11 @@ def write_report(
     Args:
         root: the results folder.
         data: what the report shows.
-        with_paper: whether tables have rows with the values that the paper states of its own rack.
-        pdf: whether pictures are also written as PDF, which takes as long as drawing them.
-        progress: shows the progress, None to show nothing.
-        workers: processes that draw, None for this process.
+        with_paper: True to add rows to tables with the values that the paper states for its own
+            rack.
+        pdf: True to write pictures as PDF too, which takes as long as drawing them.
+        progress: display of the progress; None for none.
+        workers: processes that draw; None for this process.
 
     Raises:
         ResultsError: the folder cannot be written.
@@ -218,8 +219,12 @@ experiment."""
 
 
 def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
-    """Return all tables of a report: those of `study_tables`, the timings, the phases of the jobs,
-    and the margins."""
+    """Return all tables of a report: those of `study_tables`, and those of the timings, the phases
+    of the jobs and the margins.
+
+    Args:
+        with_paper: True to add rows with the paper's values.
+    """
     beside = None if data.drivable is None or data.alone else data.drivable.summary
     found = list(study_tables(data.summary, beside, data.jerk, data.simulations, with_paper))
     robots = data.summary.robots

@@ -123,8 +123,8 @@ def payload(data: ReportData) -> Figure:
 
 
 def simulated_forces(data: ReportData) -> Figure:
-    """Draw normal forces in the simulated cell, arms under force control, beside those that were
-    predicted for how the carries were pressed there."""
+    """Draw normal forces in the simulated cell, with arms under force control, beside the predicted
+    ones."""
     looks, number = [], 0
     for found in data.simulations:
         # The hand-made trajectory looks as everywhere, the others by their order.

@@ -86,8 +86,8 @@ def carry_text(duration: float, force: float, job_duration: float, order: str) -
     Args:
         duration: duration of the carry [s].
         force: largest commanded normal force of the force-controlled arm [N].
-        job_duration: duration of the whole job [s]; NaN if there is no job, then it is left out.
-        order: words before the force, as 'press with'.
+        job_duration: duration of the whole job [s]; NaN if there is no job, to leave it out.
+        order: words before the force, such as 'press with'.
     """
     job = f", the whole job {seconds(job_duration)}" if math.isfinite(job_duration) else ""
     return f"{seconds(duration)}, {order} {newtons(force)}{job}"

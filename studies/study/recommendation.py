@@ -162,7 +162,8 @@ class StoredRecommendation:
 
     @property
     def fits(self) -> bool:
-        """True if the reference forces allow to hold the box in every case of the uncertainty."""
+        """True if the normal forces required in every case of the uncertainty are within the
+        reference forces."""
         return not self.remedies
 
     @property

@@ -241,8 +241,8 @@ def is_done(root: Path, one: SimulationRequest) -> bool:
 
 
 def wanted_carries(root: Path) -> list[SimulationRequest]:
-    """Return the carries to simulate: the hand-made one, the best of each algorithm and the
-    recommended one, as far as their files exist."""
+    """Return the carries to simulate whose files exist: the hand-made one, the best of each
+    algorithm, and the recommended one."""
     summary = read_summary(root)
     shown, places = summary.shown_files, ["", *summary.algorithms]
     files = {

@@ -283,7 +283,7 @@ def replicas(summary: CampaignSummary) -> Table:
 
 
 def effort(summary: CampaignSummary) -> Table:
-    """Return the table of computing times per replica. It is printed and never stored, because
+    """Return the table of computing times per replica. It is printed only and never stored, because
     times differ from run to run."""
     keys = ("seconds", "equivalent_evaluations")
     every = [each for name, entry in summary.algorithms.items() for each in _variants(name, entry)]

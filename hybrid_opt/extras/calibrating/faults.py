@@ -99,7 +99,11 @@ def recording_faults(workcell: Workcell, run: Recording, places: Places) -> list
 
 
 def _tare_faults(run: Recording, places: Places) -> list[Fault]:
-    """Find tares at which nothing was recorded, or an arm touches something."""
+    """Return faults of labelled tares at which nothing was recorded, or an arm touches something.
+
+    Args:
+        places: pad poses and wrenches of the run.
+    """
     found = []
     recorded = [instant for instant in run.labels.tare if run.around(instant).any()]
     if not recorded:

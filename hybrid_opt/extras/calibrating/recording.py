@@ -99,7 +99,11 @@ class Recording:
         return bool(np.isfinite(self.wrench[:, :, 3:]).all())
 
     def within(self, begin: float, end: float) -> Array:
-        """Return a mask (n,) that is True for samples between two instants [s]."""
+        """Find the samples between two instants [s].
+
+        Returns:
+            (n,) True for these samples.
+        """
         return np.asarray((self.time >= begin) & (self.time <= end))
 
     def around(self, instant: float) -> Array:
@@ -476,7 +480,11 @@ def joint_series(messages: Messages, names: list[str], path: Path) -> tuple[Arra
 
 
 def wrench_series(messages: Messages) -> tuple[Array, Array]:
-    """Return times (n,) [s] and wrenches (n, 6) of WrenchStamped or Wrench messages [N, N m]."""
+    """Read forces and moments from WrenchStamped or Wrench messages.
+
+    Returns:
+        Times (n,) [s] and wrenches (n, 6) [N, N m].
+    """
     rows = []
     for _, message in messages:
         wrench: Any = getattr(message, "wrench", message)
@@ -486,8 +494,12 @@ def wrench_series(messages: Messages) -> tuple[Array, Array]:
 
 
 def force_series(messages: Messages) -> tuple[Array, Array]:
-    """Return times (n,) [s] and normal forces (n,) [N] from messages with a number, or from
-    wrenches, of which the absolute force along z is taken."""
+    """Read normal forces from messages with one number each, or from wrenches, of which the
+    absolute force along z is taken.
+
+    Returns:
+        Times (n,) [s] and forces (n,) [N].
+    """
     if messages and hasattr(messages[0][1], "data"):
         return (
             np.array([time for time, _ in messages]),

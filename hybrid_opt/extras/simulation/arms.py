@@ -152,9 +152,9 @@ class PressedBox(HeldBox):
         """Return the active contacts between pads and box.
 
         Returns:
-            For n contacts: index (n,) of the pad's robot; True (n,) if the pad is the first of the
-            two bodies; index (n,) of the first of three constraint rows; axes (n, 3, 3) of the
-            contact as rows, world frame.
+            Four arrays for n contacts. Index (n,) of the pad's robot; True (n,) if the pad is the
+            first of the two bodies; index (n,) of the first of three constraint rows; axes (n, 3,
+            3) of the contact as rows, world frame.
         """
         contact = self._data.contact
         sides = self._pad_of_geom[contact.geom]
@@ -324,7 +324,7 @@ class _ArmSimulation:
                 frame [m/s^2].
 
         Returns:
-            (7,) pose of the box: position [m], and unit quaternion with the real part first.
+            (7,) position [m] of the box, then unit quaternion with the real part first.
         """
         data, job = self._data, self._reference.job
         data.qpos[self._q], data.qvel[self._v] = self._ticks.q[0], self._ticks.q_rate[0]

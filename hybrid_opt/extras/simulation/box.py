@@ -169,8 +169,8 @@ class HeldBox:
         """Measure how far the box has moved between its pads since the first call.
 
         Returns:
-            Slip (2,): largest displacement of the box in the plane of each pad, at the rim of its
-            patch [m]; and rotation of the box relative to the pads [rad].
+            Slip (2,), the largest displacement of the box in the plane of each pad, at the rim of
+            its patch [m]; and rotation of the box relative to the pads [rad].
         """
         axes = self._data.site_xmat[self.sites].reshape(2, 3, 3)
         places = self._data.site_xpos[self.sites][:, None]

@@ -269,10 +269,10 @@ class HeldInHands:
         """Measure how far the payload has moved in the hands.
 
         Returns:
-            Slip (2,): largest displacement of the payload along the patches of each robot's hands
-            since the first call [m]. Lift (2,): largest height of the payload above a rim of each
-            robot's hands [m], negative where all rims are pressed. Rotation of the payload relative
-            to the carriage that moves all hands, since the first call [rad].
+            Slip (2,), the largest displacement of the payload along the patches of each robot's
+            hands since the first call [m]. Lift (2,), the largest height of the payload above a rim
+            of each robot's hands [m], negative while all rims are pressed. Rotation of the payload
+            relative to the carriage, the body that bears all hands, since the first call [rad].
         """
         data = self._data
         axes = data.xmat[self._bodies].reshape(-1, 3, 3)
@@ -361,13 +361,13 @@ def lip_points(hand: Contact, points: int) -> Array:
 
 
 def _normal_stiffness(hand: Contact, settings: SimulationSettings) -> float:
-    """Return the normal stiffness of a hand's layer per area [N/m^3]."""
+    """Return the stiffness of a hand's elastic layer along the normal, per area [N/m^3]."""
     return settings.layer * hand.layer_stiffness
 
 
 def _along(hand: Contact, settings: SimulationSettings) -> tuple[float, float]:
-    """Return the stiffness of a hand's layer along the patch [N/m] and about its normal [N
-    m/rad]."""
+    """Return the stiffness of a hand's elastic layer against displacement along the patch [N/m],
+    and against rotation about the normal [N m/rad]."""
     points = lip_points(hand, settings.points)
     shear = hand.layer_shear * _normal_stiffness(hand, settings) * hand.area
     return shear, shear * float((points**2).sum(axis=1).mean())
