@@ -155,10 +155,10 @@ class HoldingHands(ContactModel):
     """Contact model of hands (cups, magnets, grippers) on both arms, of any number and with any
     normals.
 
-    Here the normal force of an arm stands for a holding force: each hand's least holding force,
-    times the ratio of the weakest hand's own force to the hand's own force; the largest of the
-    arm's hands counts. No force is commanded. In worst cases, one force limit applies to the hands
-    of both arms together.
+    The normal force of an arm is the largest holding force that one of its hands needs. It is
+    stated for the weakest hand: the need of a stronger hand is multiplied by the weakest hand's own
+    holding force over the stronger hand's. No force is commanded. In worst cases, one force limit
+    applies to the hands of both arms together.
     """
 
     assumption = "hands that hold by themselves, on arms that keep their poses"

@@ -284,7 +284,8 @@ class ContactModel(ABC):
 
     def leading_excess(self, load: ContactLoad, opposed: Expression) -> Expression:
         """Compute the normal force of robot 1 minus `leading_share` times the commanded force of
-        robot 2 [N].
+        robot 2 [N]. With two opposite pads it is the component of the load along the normal of
+        contact 1.
 
         Args:
             load: load on both contacts.

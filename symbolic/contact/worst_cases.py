@@ -78,10 +78,13 @@ def case_squeeze_function(
 ) -> ca.Function:
     """Build the function of the least commanded normal forces in one case of an uncertainty.
 
-    Inputs: pose, rate, second_rate (6,), the box pose and its time derivatives; case (18,), laid
-    out by `CASE_SIZES`; then symbolic parameters. Output: normal_force (2,) [N]. With two opposite
-    pads or holding hands, both forces are least. With other pads, the force of the robot
-    `commanded` is least, and the other robot's force results from it.
+    A case (18,) holds the true values of friction, patch radii, mass, centre of mass, disturbance,
+    displacements of the pads, missing force and force between the arms, laid out by `CASE_SIZES`.
+
+    Inputs: pose, rate, second_rate (6,), the box pose and its time derivatives; case (18,); then
+    symbolic parameters. Output: normal_force (2,) [N]. With two opposite pads or holding hands,
+    both forces are least. With other pads, the force of the robot `commanded` is least, and the
+    other robot's force results from it.
 
     Args:
         workcell: the workcell.
@@ -158,7 +161,9 @@ def case_slopes_function(workcell: Workcell) -> ca.Function:
 
 
 def case_excess_function(workcell: Workcell) -> ca.Function:
-    """Build the function of `ContactModel.leading_excess` in one case of an uncertainty.
+    """Build the function of the normal force of robot 1 in one case, minus
+    `ContactModel.leading_share` times the commanded force of robot 2
+    (`ContactModel.leading_excess`).
 
     Inputs: pose, rate, second_rate (6,), the box pose and its time derivatives; case (18,), laid
     out by `CASE_SIZES`; then the payload's symbolic parameters. Output: excess, a scalar [N].
@@ -260,7 +265,8 @@ def _origin_load(workcell: Workcell, inputs: dict[str, Expression]) -> Expressio
 
 
 def case_parts(case: ca.SX | ca.MX) -> list[ca.SX | ca.MX]:
-    """Split a case (18,) into its parts, in the order and with the sizes of `CASE_SIZES`."""
+    """Split a case (18,) into its parts, such as friction (2,) and mass (1,), in the order of
+    `CASE_SIZES`."""
     return list(ca.vertsplit(case, [0, *accumulate(CASE_SIZES.values())]))
 
 
