@@ -165,12 +165,12 @@ def driver_changes(path: Path, workcell: Workcell) -> dict[str, Any]:
     """Read the drivers and tool loads of a workcell's robots from a file.
 
     Args:
-        path: a file with `[[robots]]` sections, of which only the keys `name`, `driver` and
-            `tool_load` are read.
+        path: TOML file with a section `[[robots]]` for each robot, of which only the keys `name`,
+            `driver` and `tool_load` are read.
         workcell: the workcell.
 
     Returns:
-        Changes as `Cell.changed` takes them.
+        Changes of the workcell by key path, as for `Cell.changed`.
 
     Raises:
         WorkcellError: the file cannot be read, or states nothing about these robots.

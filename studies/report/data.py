@@ -248,13 +248,13 @@ class ReportData(Experiment):
 def gather(
     results: CampaignResults, workers: Workers | None = None, paper: bool = True
 ) -> ReportData:
-    """Read the results of a study, evaluate the carries that the report draws, and plan the jobs
-    around two of them.
+    """Collect the data of a report: read the results of a study, evaluate the carries to draw, and
+    plan the jobs around the recommended and the hand-made one.
 
     Args:
         results: folder of the finished study.
-        workers: processes for the slow calls, None for this process.
-        paper: whether the paper's pictures will be drawn too.
+        workers: processes for slow computations; None for this process.
+        paper: True if the paper's pictures will be drawn too.
 
     Raises:
         ResultsError: the folder is not complete or damaged.
@@ -313,8 +313,8 @@ def gather(
 
 
 def gather_carries(root: Path) -> tuple[CellGeometry, tuple[DrawnCarry, ...]]:
-    """Return the geometry of a study's cell, and its carries: the hand-made trajectory and the
-    selected one of each algorithm that has one.
+    """Return the geometry of a study's cell and its carries: the hand-made one, then the selected
+    one of each algorithm that has one.
 
     Args:
         root: the results folder.

@@ -277,8 +277,8 @@ class CampaignSummary:
         return files
 
     def answer(self, folder: str) -> StudyAnswer | None:
-        """Return the study's result in words: the carry to run, or the reason why there is none;
-        None where neither is stored.
+        """Return the study's result in words: the recommended carry, or the reason why there is
+        none; None if neither is stored.
 
         Args:
             folder: path of the results, put in front of the files' names; '' if it is the working

@@ -99,16 +99,15 @@ def clear_spins(query: HoldQuery, kinematics: ArmKinematics, spins: Array) -> Ar
 
 
 def initial_arc(start: Array, goal: Array, bow: Array) -> Array:
-    """Compute a path from one extended pose to another that bends aside in the middle.
+    """Compute a path of the box, and of m redundant joints, that bends aside in the middle.
 
     Args:
-        start: (6 + m,) first extended pose: box pose [m, rad] and the m redundant joints [rad or
-            m].
-        goal: (6 + m,) last extended pose.
+        start: (6 + m,) first box pose [m, rad] followed by the m redundant joints [rad or m].
+        goal: (6 + m,) last box pose and redundant joints.
         bow: (3,) displacement of the box in the middle of the path, world frame [m].
 
     Returns:
-        (GUIDE_POSES, 6 + m) extended poses.
+        (GUIDE_POSES, 6 + m) box poses followed by the redundant joints.
     """
     poses = np.linspace(start, goal, GUIDE_POSES)
     poses[:, :3] += np.sin(np.linspace(0.0, np.pi, GUIDE_POSES))[:, None] * bow

@@ -85,7 +85,8 @@ class _Follower:
 
         Args:
             T_world_box: (4, 4) pose of the box.
-            extended: (6 + m,) extended pose, of which the redundant joints are used [rad or m].
+            extended: (6 + m,) box pose followed by m redundant joints, of which only the joints are
+                used [rad or m].
             q: (joints,) joint positions at a configuration nearby [rad or m].
 
         Returns:
@@ -159,11 +160,11 @@ class ClosedChain:
         ]
 
     def close(self, extended: Array, q: tuple[Array, Array]) -> ChainConfiguration | None:
-        """Return the configuration in which both arms hold the box at an extended pose; None if an
-        arm cannot. Collisions are not checked.
+        """Return the configuration in which both arms hold the box at a given pose; None if an arm
+        cannot. Collisions are not checked.
 
         Args:
-            extended: (6 + m,) extended pose [m, rad; rad or m].
+            extended: (6 + m,) box pose [m, rad] followed by the m redundant joints [rad or m].
             q: joint positions (joints,) of each arm at a configuration nearby [rad or m].
         """
         T_world_box = box_placement(self._orientation, extended[:POSE_SIZE])
@@ -179,11 +180,11 @@ class ClosedChain:
     def close_many(
         self, extended: Array, q: tuple[Array, Array], steps: int = TRACKING_STEPS
     ) -> tuple[tuple[Array, Array], NDArray[np.bool_]]:
-        """Find the joint positions with which both arms hold the box at n extended poses.
-        Collisions are not checked.
+        """Find the joint positions with which both arms hold the box at n given poses. Collisions
+        are not checked.
 
         Args:
-            extended: (n, 6 + m) extended poses [m, rad; rad or m].
+            extended: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
             q: joint positions (n, joints) of each arm from which the solution starts [rad or m].
             steps: largest number of Newton steps.
 
@@ -210,7 +211,7 @@ class ClosedChain:
 
         Args:
             begin: configuration at the first pose of the path.
-            path: (n, 6 + m) extended poses [m, rad; rad or m].
+            path: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
         """
         batch: list[ChainConfiguration] = []
         place: ChainConfiguration | None = begin
@@ -236,7 +237,8 @@ class ClosedChain:
 
         Args:
             begins: configuration at the beginning of each path.
-            paths: (k, n, 6 + m) extended poses, neighbours at most `PATH_STEP` apart.
+            paths: (k, n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m];
+                neighbours are at most `PATH_STEP` apart.
 
         Returns:
             Configurations along each path, the one in `begins` first.
@@ -267,7 +269,7 @@ class ClosedChain:
         Args:
             first: configuration at the first pose of the path.
             last: configuration at the last pose of the path.
-            path: (n, 6 + m) extended poses [m, rad; rad or m].
+            path: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
         """
         share = np.linspace(0.0, 1.0, len(path))[:, None]
         near = [(1.0 - share) * a + share * b for a, b in zip(first.q, last.q, strict=True)]
@@ -289,7 +291,8 @@ class ClosedChain:
 
         Args:
             begin: configuration at the beginning of the motion.
-            extended: (6 + m,) extended pose at the end [m, rad; rad or m].
+            extended: (6 + m,) box pose at the end [m, rad] followed by the m redundant joints [rad
+                or m].
         """
         found = self.way(begin, straight(begin.extended, extended))
         return None if found is None else found[-1]
@@ -300,7 +303,7 @@ class ClosedChain:
 
         Args:
             begin: configuration at the first pose of the path.
-            path: (n, 6 + m) extended poses [m, rad; rad or m].
+            path: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
         """
         found = [begin, *self.along(begin, path[1:])]
         return found if len(found) == len(path) else None
@@ -316,8 +319,8 @@ class ClosedChain:
 
 
 def metric_weights(size: int) -> Array:
-    """Return the factors (size,) that turn the entries of an extended pose into lengths: 1 for
-    positions, a lever [m/rad] for angles and for redundant joints.
+    """Return the factors (size,) that turn a box pose followed by redundant joints into lengths: 1
+    for positions, a lever [m/rad] for angles and for redundant joints.
 
     Args:
         size: number of entries, 6 plus the number of redundant joints.
@@ -328,16 +331,18 @@ def metric_weights(size: int) -> Array:
 
 
 def distance(first: Array, second: Array) -> float:
-    """Compute the distance between two extended poses (6 + m,), weighted by `metric_weights`
-    [m]."""
+    """Compute the distance between two box poses that are followed by m redundant joints, each (6 +
+    m,), weighted by `metric_weights` [m]."""
     return float(np.linalg.norm(metric_weights(len(first)) * (second - first)))
 
 
 def straight(first: Array, second: Array) -> Array:
-    """Interpolate linearly between two extended poses (6 + m,), ends included.
+    """Interpolate linearly between two box poses that are followed by m redundant joints, each (6 +
+    m,) [m, rad; rad or m].
 
     Returns:
-        (n, 6 + m) extended poses, neighbours at most `PATH_STEP` apart.
+        (n, 6 + m) poses with redundant joints, both ends included, neighbours at most `PATH_STEP`
+        apart.
     """
     n = max(int(np.ceil(distance(first, second) / PATH_STEP)), 1)
     return np.asarray(np.linspace(first, second, n + 1))
@@ -372,12 +377,13 @@ branch."""
 
 @dataclass(frozen=True)
 class AffineSubspace:
-    """The extended poses among which a path is searched: origin + directions @ y with bounded y.
+    """The box poses and redundant joints among which a path is searched: origin + directions @ y
+    with bounded y.
 
     Attributes:
-        origin: (6 + m,) extended pose [m, rad; rad or m].
+        origin: (6 + m,) box pose [m, rad] followed by the m redundant joints [rad or m].
         directions: (6 + m, d) basis, scaled such that the Euclidean distance between two y equals
-            `distance` between their extended poses.
+            the `distance` of what they stand for.
         lower, upper: (d,) bounds of y [m].
         range: longest motion by which the planner's trees grow [m].
     """
@@ -389,11 +395,13 @@ class AffineSubspace:
     range: float
 
     def extended(self, y: Array) -> Array:
-        """Compute the extended pose (6 + m,) at coordinates y (d,) of the subspace [m]."""
+        """Compute the box pose followed by m redundant joints (6 + m,) at coordinates y (d,) of the
+        subspace [m]."""
         return np.asarray(self.origin + self.directions @ y)
 
     def coordinates(self, extended: Array) -> Array:
-        """Compute the coordinates (d,) [m] of an extended pose (6 + m,) in the subspace."""
+        """Compute the coordinates (d,) [m] in the subspace of a box pose followed by m redundant
+        joints (6 + m,)."""
         return np.asarray(np.linalg.pinv(self.directions) @ (extended - self.origin))
 
 
@@ -417,10 +425,11 @@ class Corridor:
 
 
 def search_subspace(start: Array, goal: Array, stray: Corridor, limits: Array) -> AffineSubspace:
-    """Compute the set of extended poses within which a path from start to goal is searched.
+    """Compute the set of box poses and redundant joints within which a path from start to goal is
+    searched.
 
     Args:
-        start, goal: (6 + m,) extended poses [m, rad; rad or m].
+        start, goal: (6 + m,) box pose [m, rad] followed by the m redundant joints [rad or m].
         stray: allowed deviation from the straight motion; redundant joints may deviate
             `REDUNDANT_ASIDE` times as far.
         limits: (m, 2) limits of the redundant joints [rad or m].
@@ -533,7 +542,7 @@ def plan(
     Args:
         chain: both arms with a fixed hold each.
         out: retreats from start and goal, whose ends are further roots of the planner's trees.
-        room: extended poses that the path may use.
+        room: box poses and redundant joints that the path may use.
         most: largest number of configurations that may be checked.
         out_of_time: function that returns True if no time is left.
         seed: seed of the planner, at least 1.

@@ -310,8 +310,8 @@ class _Search:
 
     @property
     def too_late(self) -> bool:
-        """True if too little time is left for another path, because bounds and verdicts take time
-        too."""
+        """True if the remaining time does not suffice for another path with its evaluation and its
+        bounds."""
         return self.spent > PLANNING * self.settings.seconds
 
     def _say(self, text: str) -> None:
