@@ -79,17 +79,17 @@ class StudySettings:
 
     Attributes:
         polish: settings of the polish; None for no polish.
-        drivable: whether drivable carries are searched too.
+        drivable: True to search drivable carries too.
         drivable_replicas: number of replicas of the drivable search per algorithm; None for the
             default of `drivable_settings`.
         drivable_polish: settings of the polish of drivable fronts; None for no polish.
         wish: what the recommended carry should be best at.
         target: target of the export that the recommendation names; None for any simulator.
-        simulate: whether the selected carries are simulated in the whole cell.
-        report: whether figures, tables and the page are written.
-        with_paper: whether the paper's figures are shown beside the study's.
-        paper: whether the report has the paper's pictures.
-        pdf: whether pictures are also written as PDF.
+        simulate: True to simulate the selected carries in the whole cell.
+        report: True to write figures, tables and the page.
+        with_paper: True to show the paper's figures beside the study's.
+        paper: True for a report with the paper's pictures.
+        pdf: True to write pictures as PDF too.
         recommend_only: True to compute only what the recommendation needs.
     """
 
@@ -204,8 +204,7 @@ def run_study(
 
 
 def study_text(root: Path, with_paper: bool, brief: bool = False) -> str:
-    """Format the figures of a finished study for a terminal, with the recommended carry first. With
-    `brief`, only the recommended carry is shown, if there is one.
+    """Format the figures of a finished study for a terminal, with the recommended carry first.
 
     Args:
         with_paper: True to show the paper's values beside those of the study.

@@ -135,8 +135,8 @@ class Look:
 
     Attributes:
         time: time of the measurement [s].
-        s: commanded coordinate of the job: planned time along its path [s].
-        direction: rate of the coordinate, 1 forward or -1 back.
+        s: commanded place on the path, as its planned time [s].
+        direction: rate of the planned time, 1 forward or -1 back.
         age: time since each arm's posture was measured [s].
         q: joint positions of each arm [rad or m].
     """
@@ -209,8 +209,8 @@ class Looks:
         return max(found) / max(planned)
 
     def late(self, job: Job, arm: int) -> float:
-        """Return the median delay of an arm's measured posture behind the commanded coordinate
-        [s]."""
+        """Return the median delay of an arm's measured posture behind the commanded place on the
+        path [s]."""
         fastest, found = max(job.speed(arm, s) for s in job.time), []
         for look in self.moving:
             forward = look.direction

@@ -49,7 +49,8 @@ class Limits:
         start: largest distance of a pad from its first position [m].
         path: largest distance of a pad from its planned path [m].
         behind: largest delay of an arm behind its reference [s].
-        skew: largest difference between the coordinates of both arms along the path [s].
+        skew: largest difference between the planned times of the places on the path that both arms
+            have reached [s].
         force: largest deviation of a measured force from its reference while the box is held, over
             the reference.
         silence: longest time since an arm's last measurement [s].
@@ -72,7 +73,7 @@ class Switch:
     """A phase of a job in which hands are switched on or off.
 
     Attributes:
-        begin, end: first and last coordinate of the phase, as planned time [s].
+        begin, end: planned time at which the phase begins, and ends [s].
         on: True if the hands are switched on when the job runs forward.
     """
 
@@ -132,16 +133,16 @@ class Job:
 
     @property
     def end(self) -> float:
-        """Last coordinate of the path [s]."""
+        """Planned time of the last sample [s]."""
         return self.time[-1]
 
     def phase(self, s: float) -> str:
-        """Return the name of the phase at a coordinate [s]."""
+        """Return the name of the phase at a planned time s [s]."""
         return next((name for last, name in self._phases if s <= last), self._phases[-1][1])
 
     def begin(self, name: str) -> float:
-        """Return the coordinate at which a phase begins [s]; the last coordinate if the job has no
-        such phase.
+        """Return the planned time at which a phase begins [s]; the end of the job if it has no such
+        phase.
 
         Args:
             name: name of the phase.
@@ -161,7 +162,7 @@ class Job:
         one at the end of the set-down, and `stand` has not been called.
 
         Args:
-            s: coordinate [s].
+            s: planned time [s].
         """
         if self.phase(s) != "set_down" or self.is_standing:
             return False
@@ -178,7 +179,7 @@ class Job:
         positions. So soft arms release the box too.
 
         Args:
-            s: coordinate in the set-down at which the box stands [s].
+            s: planned time, within the set-down, at which the box stands [s].
             q: measured joint positions of each arm [rad or m]; None if unknown.
         """
         end, self._early = self.begin("release"), None
@@ -196,19 +197,19 @@ class Job:
 
     @cached_property
     def pressed(self) -> float:
-        """Coordinate from which the pads or hands alone hold the box [s]."""
+        """Planned time from which the pads or hands alone hold the box [s]."""
         return min(self.begin(name) for name in HELD)
 
     def is_gripped(self, s: float) -> bool:
-        """Return True if the pads touch the box at a coordinate s [s] but the box is not lifted
+        """Return True if the pads touch the box at a planned time s [s] but the box is not lifted
         yet."""
         return self._phases[0][0] < s <= self.pressed
 
     def grips(self, s: float, direction: float) -> bool:
-        """Return True if hands are to be switched on at a coordinate.
+        """Return True if hands are to be switched on at a place of the path.
 
         Args:
-            s: coordinate [s].
+            s: planned time of the place [s].
             direction: 1 if the job runs forward, -1 if it runs back.
         """
         passed = [
@@ -219,12 +220,12 @@ class Job:
         return passed[-1] if passed else False
 
     def holds(self, s: float) -> bool:
-        """Return True if hands have to hold the box at a coordinate [s], whether the job runs
+        """Return True if hands have to hold the box at a planned time s [s], whether the job runs
         forward or back."""
         return self.grips(s, 1.0) and self.grips(s, -1.0)
 
     def _place(self, s: float) -> tuple[int, float, float]:
-        """Find the interval between two samples that contains a coordinate s [s].
+        """Find the interval between two samples that contains a planned time s [s].
 
         Returns:
             Index of the sample before s, passed share of the interval in [0, 1], and length of the
@@ -235,7 +236,7 @@ class Job:
         return k, min(max((s - self.time[k]) / step, 0.0), 1.0), step
 
     def position(self, arm: int, s: float) -> list[float]:
-        """Interpolate the planned joint positions of an arm at a coordinate s [s], by cubic
+        """Interpolate the planned joint positions of an arm at a planned time s [s], by cubic
         polynomials [rad, or m for sliding joints]."""
         k, x, step = self._place(s)
         q, v = self.robots[arm]["position"], self.robots[arm]["velocity"]
@@ -253,7 +254,7 @@ class Job:
         return found
 
     def linear(self, arm: int, name: str, s: float) -> list[float]:
-        """Interpolate values of an arm at a coordinate s [s] linearly between samples.
+        """Interpolate values of an arm at a planned time s [s] linearly between samples.
 
         Args:
             name: key of the values in the arm's part of the document.
@@ -263,21 +264,22 @@ class Job:
         return [(1.0 - x) * a + x * b for a, b in zip(rows[k], rows[k + 1], strict=True)]
 
     def force(self, arm: int, s: float) -> float:
-        """Return the commanded normal force of an arm at a coordinate s [s], in newtons."""
+        """Return the commanded normal force of an arm at a planned time s [s], in newtons."""
         k, x, _ = self._place(s)
         rows = self.robots[arm]["normal_force"]
         return float((1.0 - x) * rows[k] + x * rows[k + 1])
 
     def effort(self, arm: int, gravity: str, s: float, rate: float) -> list[float]:
-        """Return the planned joint torques of an arm at a coordinate, adapted to the rate at which
-        the job runs [N m, for sliding joints N].
+        """Return the joint torques of an arm at a planned time, adapted to the rate at which the
+        job runs [N m, for sliding joints N].
 
         Args:
             arm: index of the arm.
             gravity: 'with_gravity' or 'without_gravity': whether the torques include the arm's
                 weight.
-            s: coordinate [s].
-            rate: derivative of the coordinate with respect to time; 1 at the planned speed.
+            s: planned time [s].
+            rate: derivative of the planned time with respect to time; 1 at the planned speed, 0 at
+                rest.
         """
         moving = self.linear(arm, f"effort_{gravity}", s)
         holding = self.linear(arm, f"hold_effort_{gravity}", s)
@@ -289,27 +291,27 @@ class Job:
         Args:
             arm: index of the arm.
             q: joint positions of the arm [rad or m].
-            s: coordinate of the planned place [s].
+            s: planned time of that place [s].
         """
         reach = self.robots[arm]["reach"]
         planned = self.position(arm, s)
         return float(sum(r * abs(a - b) for r, a, b in zip(reach, q, planned, strict=True)))
 
     def speed(self, arm: int, s: float) -> float:
-        """Return an upper bound of the planned speed of an arm's pad at a coordinate s [s], in
+        """Return an upper bound of the planned speed of an arm's pad at a planned time s [s], in
         m/s."""
         rates = self.linear(arm, "velocity", s)
         reach = self.robots[arm]["reach"]
         return float(sum(r * abs(v) for r, v in zip(reach, rates, strict=True)))
 
     def _project(self, arm: int, q: Sequence[float], s: float) -> float:
-        """Estimate the coordinate at which an arm's path is nearest to a posture, by one
+        """Estimate the planned time at which an arm's path is nearest to a posture, by one
         Gauss-Newton step [s].
 
         Args:
             arm: index of the arm.
             q: joint positions of the arm [rad or m].
-            s: coordinate from which the step is made [s].
+            s: planned time from which the step is made [s].
         """
         planned, rates = self.position(arm, s), self.linear(arm, "velocity", s)
         rows = zip(self.robots[arm]["reach"], q, planned, rates, strict=True)
@@ -327,13 +329,13 @@ class Job:
         window: tuple[float, float],
         near: float = NEAR,
     ) -> float:
-        """Find the coordinate at which the planned posture of an arm is nearest to a measured one
-        [s]. Of equally near places the one nearest to s is returned.
+        """Find the planned time at which an arm's planned posture is nearest to a measured one [s].
+        Of equally near ones the time nearest to s is returned.
 
         Args:
             arm: index of the arm.
             q: measured joint positions [rad or m].
-            s: coordinate around which to search [s].
+            s: planned time around which to search [s].
             window: least and largest difference of the result from s [s].
             near: if the pad is at most this far from its planned place at s, s itself is returned
                 [m].

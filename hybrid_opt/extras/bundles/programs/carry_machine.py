@@ -45,8 +45,8 @@ class Moment:
 
     Attributes:
         time: time from now [s].
-        s: coordinate, the planned time of the place on the path [s].
-        rate: derivative of the coordinate with respect to time.
+        s: planned time of the place on the path [s].
+        rate: derivative of s with respect to time.
         change: derivative of the rate with respect to time [1/s].
     """
 
@@ -57,22 +57,21 @@ class Moment:
 
 
 class Clock:
-    """The commanded place on the path of a job, and how fast it moves. The place is given by a
-    coordinate, its planned time.
+    """The commanded place on the path of a job, given by its planned time s, and how fast it moves.
 
     Attributes:
-        s: coordinate of both arms [s].
+        s: planned time of the place of both arms [s].
         rate: derivative of s with respect to time: 1 at the planned speed, 0 at rest, -1 backwards.
     """
 
     def __init__(self, end: float, stop_time: float, s: float = 0.0, rate: float = 0.0) -> None:
-        """Start at a coordinate with a rate.
+        """Start at a place with a rate.
 
         Args:
-            end: last coordinate of the path [s].
+            end: planned time of the end of the path [s].
             stop_time: duration of a change of the rate by 1 [s].
-            s: first coordinate [s].
-            rate: first rate.
+            s: planned time of the first place [s].
+            rate: first derivative of s with respect to time.
         """
         self.s, self.rate, self._stop_time = s, rate, stop_time
         self._low, self._high = 0.0, end
@@ -80,19 +79,19 @@ class Clock:
         self._from, self._to, self._since = rate, rate, 0.0
 
     def keep(self, low: float, high: float) -> None:
-        """Limit the coordinate to the range from `low` to `high` [s]."""
+        """Limit the planned time of the commanded place to the range from `low` to `high` [s]."""
         self._low, self._high = low, high
 
     @property
     def turning(self) -> bool:
-        """True while the rate changes."""
+        """True while the rate changes, at which the commanded place moves on the path."""
         return self._from != self._to
 
     def turn(self, rate: float, after: float = 0.0, takes: float | None = None) -> None:
-        """Start a smooth change of the rate.
+        """Start a smooth change of the rate, at which the commanded place moves on the path.
 
         Args:
-            rate: rate after the change.
+            rate: rate after the change: 1 for the planned speed, 0 for rest, -1 for backwards.
             after: time until the change begins [s].
             takes: duration of a change of the rate by 1 [s]; None for the stop time of the clock.
         """
@@ -101,8 +100,8 @@ class Clock:
             self._takes = self._stop_time if takes is None else takes
 
     def advance(self, dt: float) -> None:
-        """Advance the time by dt [s]. The resulting coordinate does not depend on the number of
-        calls."""
+        """Move the commanded place on for dt [s]. The result does not depend on the number of calls
+        into which a time is divided."""
         count = max(1, math.ceil(dt / FINE)) if self.turning else 1
         for _ in range(count):
             self._step(dt / count)
@@ -133,8 +132,8 @@ class Clock:
         return sign * 30.0 * x * x * (1.0 - x) ** 2 / self._takes
 
     def ahead(self, rate: float, step: float) -> Iterator[Moment]:
-        """Yield the states from now on if the rate changes to a given one, until the coordinate
-        moves no more.
+        """Yield the states from now on if the rate changes to a given one, until the commanded
+        place moves no more.
 
         Args:
             rate: rate after the change.
@@ -284,8 +283,8 @@ class Machine:
         return self.job.grips(self.clock.s, self._direction)
 
     def _aim(self, direction: float) -> None:
-        """List the coordinates ahead at which the clock has to wait until inputs report the state
-        of hands, and limit the clock to the first.
+        """List the places ahead at which the clock has to wait until inputs report the state of
+        hands, and limit the clock to the first.
 
         Args:
             direction: 1 forward, -1 back.
@@ -298,7 +297,7 @@ class Machine:
         self._next_gate()
 
     def _next_gate(self) -> None:
-        """Let the clock run to the next coordinate at which it has to wait for hands."""
+        """Let the clock run to the next place at which it has to wait for hands."""
         self._waited = 0.0
         low, high = 0.0, self.job.end
         if self._gates and self._direction > 0.0:

@@ -285,7 +285,7 @@ class Stream:
 
     def _inward(self, s: float) -> list[float]:
         """Compute the motion of each joint of the pressing arm per motion of its pad along the
-        normal, at a coordinate s [s] of the job [rad/m]."""
+        normal, at a planned time s [s] [rad/m]."""
         rows, time = self.config["inward"], self.job.time
         k = min(max(bisect_left(time, s) - 1, 0), len(rows) - 2)
         share = min(max((s - time[k]) / (time[k + 1] - time[k]), 0.0), 1.0)
