@@ -159,8 +159,8 @@ seems to limit the speed itself."""
 
 
 def egm_files(export: Export) -> dict[str, str | bytes]:
-    """Return the files of the target: the program that streams the job, and the RAPID code that
-    starts EGM in both tasks."""
+    """Return the files of the target `abb-egm` by path: the program that streams the job, and the
+    RAPID code that starts EGM in the tasks of both arms."""
     robots, follower, q = export.workcell.robots, export.follower, export.sampled.q
     J = pad_jacobians(export.workcell, follower, export.sampled.arm(follower, q))
     # Along the pad's normal, without turning it.

@@ -158,8 +158,8 @@ def pad_stiffness(job: Job) -> float:
 
 
 def torque_files(export: Export) -> dict[str, str | bytes]:
-    """Return the files of the target: programs, controllers, and `config/cell.json` with the
-    settings of the driver.
+    """Return the files of the target `torque` by path: programs, controllers, and
+    `config/cell.json` with the settings of the driver.
 
     Raises:
         SettingsError: a torque changes faster than libfranka accepts.

@@ -85,7 +85,7 @@ def normal_speed(job: Job, arm: int) -> float:
 
 
 def urscript_files(export: Export) -> dict[str, str | bytes]:
-    """Return the programs of both arms, by path.
+    """Return the URScript programs of both arms, by path.
 
     Raises:
         SettingsError: the time step is not a multiple of the controller's cycle that fills every
@@ -175,7 +175,8 @@ def _phase(export: Export, arm: int, index: int, name: str) -> Iterator[str]:
 
 
 def _payload(export: Export, arm: int) -> str:
-    """Return the arguments of set_target_payload: mass [kg], and centre in the flange frame [m]."""
+    """Return the arguments of URScript's set_target_payload: mass of the arm's tool [kg], and its
+    centre of mass in the flange frame [m]."""
     mass, centre = export.tool_load(arm)
     return f"{mass:.4f}, {_list(centre)}"
 

@@ -64,7 +64,7 @@ class ChainConfiguration:
 
 
 class _Follower:
-    """One arm of the closed chain, with Pinocchio's numeric model."""
+    """One arm that follows the box with a fixed hold, with Pinocchio's numeric model."""
 
     def __init__(self, many: ArmKinematics, hold: Hold, model: pin.Model) -> None:
         robot = many.workcell.robots[many.arm]

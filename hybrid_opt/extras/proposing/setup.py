@@ -171,10 +171,10 @@ class Setup:
     """A cell with the pairs of holds in it.
 
     Attributes:
-        given: earlier additions to the problem's tables, such as bases.
+        given: additions to the problem's tables that were chosen before, such as bases.
         workcell: the cell, with chosen redundant joints.
         bodies: arms and bodies of the cell.
-        pairs: pairs of holds, the most promising first.
+        pairs: pairs of holds, one hold of each arm, the most promising first.
     """
 
     given: dict[str, Any]

@@ -83,11 +83,11 @@ class Switch:
 
 
 class Job:
-    """A job read from its file. A place on its path is given by a coordinate: the planned time [s].
+    """A job read from its file. A place on its path is given by its planned time s [s].
 
     Attributes:
         document: content of the file as JSON values.
-        time: coordinate of each sample [s].
+        time: planned time of each sample [s].
         robots: part of the document for each arm.
         limits: limits at which the job is stopped.
     """
