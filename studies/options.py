@@ -167,7 +167,9 @@ def _require_results(path: Path) -> None:
     _require_folder(path, RESULTS)
     name = stated("hybrid_opt.campaign.settings.CONFIGURATION")
     if not os.path.lexists(path / name):
-        raise SettingsError(f"{path}: is no results folder, {name} is missing")
+        raise SettingsError(
+            f"{path}: is no results folder, {name} is missing", code="no-results-folder"
+        )
 
 
 def _require_any(path: Path) -> None:

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.contact.registry import contact_model
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
 from symbolic.records.problems import shown
@@ -166,6 +165,9 @@ def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
     coefficient. For hands that hold without a squeeze it is the tangential force of a hand over the
     friction of its holding force.
     """
+    # Not imported at the top: programs' options name objectives without CasADi.
+    from symbolic.contact.registry import contact_model
+
     if not contact_model(workcell).is_squeeze:
         bearing = workcell.task.reference_force * [pad.friction for pad in workcell.contacts]
         return np.asarray((outputs["tangential_force"] / bearing).max(axis=(1, 2)))

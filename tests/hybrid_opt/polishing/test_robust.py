@@ -114,7 +114,7 @@ def test_rows_are_those_of_the_robust_forces_with_their_slopes() -> None:
     made = programs()
     program, d, h = made.at(), direction(made.at(), 4), 3e-5
     rows = slice(program.rows.shape[1] - ROBUST_ROWS, None)
-    path = made.intervals.path(made.x)
+    path = made.intervals.path(made.cell.waypoints(made.x))
     begins = made.timed.squared[:-1]
     a = np.diff(made.timed.squared) * len(begins) / 2.0
     pose, first, second = (np.ascontiguousarray(part[:-1, :6]) for part in path)

@@ -158,11 +158,11 @@ def test_wishes_are_kept_and_little_is_given_away(
 def test_the_cost_of_a_partners_stop_is_told(
     drivable: ho.Cell, front: ho.Front, found: Recommendation
 ) -> None:
-    """60 mm within 0.2 s are 0.3 m/s, and the same path without that limit is faster."""
+    """60 mm within 0.25 s are 0.24 m/s, and the same path without that limit is faster."""
     slow = drivable.changed({"handling.partner_stop": 0.06})
     answer = ho.recommend(ho.Front.of(slow, front.x[[found.member]]))
     speed = np.linalg.norm(answer.carry.rate[:, :3], axis=1).max()
-    assert speed == pytest.approx(0.3, rel=1e-3)
+    assert speed == pytest.approx(0.24, rel=1e-3)
     other = answer.rivals[-1]
     assert "without partner_stop" in repr(answer)
     assert found.duration < other.duration_at_force < answer.duration
@@ -171,7 +171,7 @@ def test_the_cost_of_a_partners_stop_is_told(
     time = np.linspace(0.0, motion.time[-1], 2000)
     pose = np.column_stack([np.interp(time, motion.time, column) for column in motion.pose.T])
     turned = box_rotation(cell.task.orientation, pose)
-    later = np.searchsorted(time, time + 0.2, side="right") - 1
+    later = np.searchsorted(time, time + 0.25, side="right") - 1
     for contact in cell.contacts:
         pad = pose[:, :3] + turned @ contact.T_box_pad[:3, 3]
         apart = max(apart, float(np.linalg.norm(pad[later] - pad, axis=1).max()))

@@ -86,7 +86,7 @@ def test_a_new_cell_needs_no_compiler_and_its_meshes_are_told(
     assert any("At rest, level" in line for line in found.lines)
     vertices = 8 + len(ball.vertices)
     assert found.meshes == {
-        "part.stl": {"parts": 2, "vertices": vertices, "pieces": 1, "corners": 8}
+        "part.stl": {"parts": 2, "open_parts": 0, "vertices": vertices, "pieces": 1, "corners": 8}
     }
     told = f"  part.stl: {vertices} vertices in 2 part(s) became 8 in 1 convex piece(s)"
     assert told in found.lines

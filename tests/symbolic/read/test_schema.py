@@ -65,7 +65,7 @@ def test_keys_are_those_that_the_reader_knows(tmp_path: Path) -> None:
     cell = sample_data()
     cell["robots"][0] |= {"driver": {}, "tool_load": {"mass": 1.0}}
     cell |= {"collision": {"ignored": [{}]}, "uncertainty": {}, "handling": {}}
-    cell["contacts"][0]["further"] = [{}]
+    cell["contacts"][0] |= {"further": [{}], "kind": "cup"}
     cell["task"] |= {"redundant": [{}], "allowed_contacts": [{}], "waypoints": [{}]}
     kinds = ("box", "cylinder", "sphere", "mesh")
     cell["environment"] = [{"name": kind, "kind": kind} for kind in kinds]
