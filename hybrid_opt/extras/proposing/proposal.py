@@ -358,6 +358,9 @@ class _Search:
             self._say("ways to hold the box")
             try:
                 lazy.setup = prepare(self.problem, lazy.given, lazy.spins, self.rng, self._say)
+            except NoHoldError as error:
+                # Neither other holds nor other bases free the payload.
+                raise NoHoldError(f"{self._without_carry}: {error}") from error
             except (ProposalError, WorkcellError) as error:
                 if isinstance(error, WorkcellError) and not lazy.given:
                     raise  # the file is wrong, not the bases that were tried
@@ -389,8 +392,12 @@ class _Search:
         the same sides as a path of box poses (n, 6) [m, rad]."""
         return bool(self.known) and (id(pair), box.sides_passed(path)) in self.known
 
+    @property
+    def _without_carry(self) -> str:
+        return f"{self.problem.source}: no carry found in {self.spent:.0f} s"
+
     def _failed(self, setups: list[_Lazy]) -> ProposalError:
-        begin = f"{self.problem.source}: no carry found in {self.spent:.0f} s"
+        begin = self._without_carry
         if not setups:
             return ProposalError(
                 f"{begin}: no bases from which both arms follow the box were found"

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt.errors import ProposalError
+from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.evaluate.explanation import missing_reach
 from hybrid_opt.extras.proposing.common import common_positions
 from hybrid_opt.extras.proposing.holding import (
@@ -215,7 +215,7 @@ def prepare(
     judge = judge_of(bodies)
     blocked = box_blocked(judge, start, goal)
     if blocked:
-        raise ProposalError(blocked)
+        raise NoHoldError(blocked)
     query = HoldQuery(start, goal, spins, judge)
     arms = [ArmKinematics(workcell, arm) for arm in (0, 1)]
     pairs: list[Pair] = []
