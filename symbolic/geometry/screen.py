@@ -22,7 +22,7 @@ from symbolic.expression import number
 from symbolic.geometry.bodies import WORLD, ArmGeometry, CollisionBody, Frame
 from symbolic.geometry.covers import chain_cover, close_pairs, slab_cover
 from symbolic.geometry.expressions import clean
-from symbolic.geometry.pairs import CellGeometry, chain_radius
+from symbolic.geometry.pairs import CellGeometry
 from symbolic.geometry.pieces import (
     Hull,
     Piece,
@@ -32,6 +32,7 @@ from symbolic.geometry.pieces import (
     farthest_from_point,
     support,
 )
+from symbolic.geometry.separation import chain_radius
 from symbolic.records import Box, Capsule, Cylinder, Sphere
 from symbolic.records.content import CacheKey, ContentRecord
 from symbolic.records.numbered import ParameterGroup

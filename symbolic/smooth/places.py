@@ -259,7 +259,7 @@ class ManipulabilityLimit(PathConstraint):
 
     @property
     def family(self) -> str:
-        """Name of the constraint's family, which contains only this arm."""
+        """Name of the constraint's family, whose only member is the limit of this arm."""
         return f"reach_{self.arm + 1}"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:

@@ -21,8 +21,8 @@ from hybrid_opt.extras.proposing.setup import redundancy
 from hybrid_opt.extras.proposing.trial import PayloadSceneChecker
 from symbolic.array import Array
 from symbolic.geometry.bodies import WORLD, MeshReader, collision_bodies, shape_pieces
-from symbolic.geometry.pairs import coal_distance
 from symbolic.geometry.pieces import Piece
+from symbolic.geometry.separation import coal_distance
 from symbolic.read.cell import stretched_length
 from symbolic.read.editing import merged
 from symbolic.records import Cylinder, Workcell

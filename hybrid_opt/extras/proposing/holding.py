@@ -24,7 +24,8 @@ from hybrid_opt.extras.proposing.kinematics import (
 from hybrid_opt.extras.proposing.trial import PoseJudge
 from symbolic.array import Array
 from symbolic.geometry.bodies import WORLD, Frame
-from symbolic.geometry.pairs import coal_distance, tools_in_payload
+from symbolic.geometry.pairs import tools_in_payload
+from symbolic.geometry.separation import coal_distance
 from symbolic.read.arms import arm_model
 from symbolic.records import Contact
 from symbolic.records.poses import box_placement, inverse

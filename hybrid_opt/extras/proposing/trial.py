@@ -29,8 +29,9 @@ from symbolic.cell_model import (
 from symbolic.contact.registry import contact_model
 from symbolic.functions import motion_function
 from symbolic.geometry.bodies import MeshReader, shape_pieces
-from symbolic.geometry.pairs import CellGeometry, coal_distance
+from symbolic.geometry.pairs import CellGeometry
 from symbolic.geometry.pieces import Piece, support
+from symbolic.geometry.separation import coal_distance
 from symbolic.records import PAYLOAD_NAME, Handling, Workcell
 from symbolic.records.poses import box_placement
 from symbolic.records.task import initial_decision

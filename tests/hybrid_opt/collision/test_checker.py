@@ -21,7 +21,8 @@ from hybrid_opt.collision.between import (
 )
 from hybrid_opt.collision.checker import RESTING_TOLERANCE, CollisionChecker, Verdict
 from symbolic.array import Array
-from symbolic.geometry.pairs import CellGeometry, build_geometry, coal_distance, coal_geometry
+from symbolic.geometry.pairs import CellGeometry, build_geometry
+from symbolic.geometry.separation import coal_distance, coal_geometry
 from symbolic.records import AllowedContact, CollisionSettings, Uncertainty, Workcell
 from tests.symbolic.geometry.collision_cells import (
     Configurations,

@@ -26,8 +26,8 @@ from hybrid_opt.collision.distances import (
 from symbolic.array import Array
 from symbolic.geometry.bodies import collision_bodies
 from symbolic.geometry.hulls import hull_of
-from symbolic.geometry.pairs import coal_distance, coal_geometry
 from symbolic.geometry.pieces import ConvexShape, Hull, Piece
+from symbolic.geometry.separation import coal_distance, coal_geometry
 from symbolic.records import Box, Capsule, Cylinder, Sphere
 from tests.hybrid_opt.cells import shipped
 from tests.symbolic.geometry.collision_cells import ur10_cell

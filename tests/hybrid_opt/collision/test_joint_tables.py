@@ -8,7 +8,8 @@ import pytest
 import hybrid_opt as ho
 from hybrid_opt.collision.joint_tables import CELLS, JointTable, joint_tables
 from symbolic.array import Array
-from symbolic.geometry.pairs import CellGeometry, build_geometry, coal_distance, relative_placement
+from symbolic.geometry.pairs import CellGeometry, build_geometry
+from symbolic.geometry.separation import coal_distance, relative_placement
 
 
 @pytest.fixture(scope="module")

@@ -15,8 +15,9 @@ import trimesh
 from symbolic.array import Array
 from symbolic.geometry.clearance import screening_functions
 from symbolic.geometry.expressions import EXACT, Softness
-from symbolic.geometry.pairs import CellGeometry, build_geometry, coal_distance
+from symbolic.geometry.pairs import CellGeometry, build_geometry
 from symbolic.geometry.pieces import Piece
+from symbolic.geometry.separation import coal_distance
 from symbolic.read.cell import changed_text, load
 from symbolic.records import Body, Box, Cylinder, Mesh, Robot, Sphere, Workcell
 from symbolic.records.poses import pose_matrix

@@ -16,16 +16,10 @@ from hybrid_opt.extras.proposing.problem import read_problem
 from symbolic.array import Array
 from symbolic.errors import CollisionModelError
 from symbolic.geometry.bodies import MeshReader, _link_pieces, collision_bodies
-from symbolic.geometry.pairs import (
-    CellGeometry,
-    _gap,
-    _sorted,
-    build_geometry,
-    coal_distance,
-    pair_tolerance,
-)
+from symbolic.geometry.pairs import CellGeometry, _sorted, build_geometry, pair_tolerance
 from symbolic.geometry.pieces import Hull, Piece, ball, farthest_from_axis, skeleton, support
 from symbolic.geometry.screen import reach_about_joints
+from symbolic.geometry.separation import _gap, coal_distance
 from symbolic.read.cell import load
 from symbolic.records import (
     Body,

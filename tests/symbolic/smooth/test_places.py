@@ -17,7 +17,7 @@ from symbolic.array import Array
 from symbolic.contact.registry import contact_model
 from symbolic.functions import candidate_function
 from symbolic.geometry.clearance import screening_functions
-from symbolic.geometry.pairs import coal_distance
+from symbolic.geometry.separation import coal_distance
 from symbolic.path.rotation import rotation_matrix
 from symbolic.records.cell import PAYLOAD_NAME, Box, Workcell
 from symbolic.records.poses import Orientation

@@ -34,7 +34,7 @@ from hybrid_opt.job.plan import job_geometry
 from symbolic.array import Array
 from symbolic.cell_model import build_cell_bodies
 from symbolic.errors import SettingsError, WorkcellError
-from symbolic.geometry.pairs import coal_distance
+from symbolic.geometry.separation import coal_distance
 from symbolic.read.arms import arm_model
 from symbolic.read.cell import load
 from symbolic.read.editing import completed, merged
