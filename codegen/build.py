@@ -39,7 +39,7 @@ from codegen.compiler import (
 from codegen.errors import CodegenError, FormError
 from codegen.function import NumericFunction, Signature, available_cores
 from codegen.parts import CodePart, in_parts
-from codegen.tape import Tape, TapeFunction
+from codegen.tape import Tape, TapeFunction, compiled_tape
 
 if TYPE_CHECKING:
     import casadi as ca
@@ -296,24 +296,25 @@ def load_or_build(
     full = _set_key(key, levels, lanes, cache, taped)
 
     def members() -> dict[str, Library | StoredTape]:
-        tapes: dict[str, Library | StoredTape] = {}
+        tapes: dict[str, StoredTape] = {}
 
         def sources() -> Iterator[CSource]:
             functions = dict(make())
             for name in list(functions) if taped else ():
                 if (tape := Tape.of(functions[name])) is not None:
-                    tapes[name] = _taped(tape, cache)
+                    tapes[name] = _stored(tape, cache)
                     del functions[name]
             yield from _sources_of(lambda: functions, levels or {}, lanes)
 
-        compiled = _compiled(sources(), cache)
-        return tapes | {name: library for name, (library, _) in compiled.items()}
+        # The tapes are stored while the sources are made.
+        libraries = _libraries(sources(), cache)
+        return {**libraries, **tapes}
 
     found = _obtained(full, members, cache, _member)
     return {name: member.function() for name, member in found.items()}
 
 
-def _taped(tape: Tape, cache: Cache) -> StoredTape:
+def _stored(tape: Tape, cache: Cache) -> StoredTape:
     """Store a tape in the cache."""
     signature = tape.signature.to_json()
     content = tape.instructions.tobytes().hex()
@@ -359,12 +360,12 @@ def load_or_compile(
 
     cache = cache or Cache()
 
-    def build_it() -> dict[str, Library]:
+    def source() -> Iterator[CSource]:
         signature, text = make()
-        source = CSource(signature.name, text, HANDWRITTEN_LEVEL, signature=signature)
-        return {name: library for name, (library, _) in _compiled([source], cache).items()}
+        yield CSource(signature.name, text, HANDWRITTEN_LEVEL, signature=signature)
 
-    (library,) = _obtained(_set_key(key, None, 1, cache), build_it, cache, _loaded).values()
+    full = _set_key(key, None, 1, cache)
+    (library,) = _obtained(full, lambda: _libraries(source(), cache), cache, _loaded).values()
     return library.function()
 
 
@@ -399,14 +400,13 @@ def load_or_build_program(
 
     cache = cache or Cache()
 
-    def build_it() -> dict[str, Library]:
+    def source() -> Iterator[CSource]:
         from codegen.source import program_source
 
-        source = CSource(name, program_source(make(), own, lanes), LANE_LEVEL, lanes)
-        return {name: _compiled([source], cache)[name][0]}
+        yield CSource(name, program_source(make(), own, lanes), LANE_LEVEL, lanes)
 
     full = key_of("program", name=name, of=_set_key(key, None, lanes, cache), own=own)
-    return _obtained(full, build_it, cache, _loaded)[name].handle
+    return _obtained(full, lambda: _libraries(source(), cache), cache, _loaded)[name].handle
 
 
 def _sources_of(
@@ -426,7 +426,8 @@ def _set_key(
     return key_of(
         "set",
         recipe=key,
-        taped=taped,
+        # A tape names operations by their numbers.
+        taped=compiled_tape().OPERATIONS if taped else [],
         levels=sorted((levels or {}).items()),
         lanes=lanes,
         compiler=compiler_of(cache).identity,
@@ -460,6 +461,11 @@ def _obtained(
         return built
 
     return cache.obtain(key, find, made)[0]
+
+
+def _libraries(sources: Iterable[CSource], cache: Cache) -> dict[str, Library]:
+    """Compile sources, or take their libraries from the cache; return the libraries by name."""
+    return {name: library for name, (library, _) in _compiled(sources, cache).items()}
 
 
 def _remember(key: str, built: Mapping[str, Library | StoredTape], cache: Cache) -> None:

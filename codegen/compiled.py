@@ -110,7 +110,7 @@ class CompiledFunction(NumericFunction):
         n: int,
         threads: int,
     ) -> None:
-        self._require_shared(batched)
+        self._require_one_value(batched)
         of_batch = ports(self.signature, inputs, batched, outputs)
         begin_of_ports = ctypes.addressof(of_batch)
         if threads == 1 or n == 1:
@@ -139,7 +139,7 @@ class CompiledFunction(NumericFunction):
         for future in futures:
             future.result()
 
-    def _require_shared(self, batched: Sequence[bool]) -> None:
+    def _require_one_value(self, batched: Sequence[bool]) -> None:
         """Check that inputs with one value for all lanes have no value per evaluation.
 
         Raises:
@@ -157,7 +157,7 @@ class CompiledFunction(NumericFunction):
     def _prepared(
         self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
     ) -> tuple[Callable[[int], None], Callable[[], NativeCall]]:
-        self._require_shared(batched)
+        self._require_one_value(batched)
         of_batch = ports(self.signature, inputs, batched, outputs)
         begin_of_ports = ctypes.addressof(of_batch)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import casadi as ca
 import numpy as np
@@ -140,7 +141,9 @@ def test_what_is_no_function_of_known_scalars_is_left_to_casadi() -> None:
     np.testing.assert_allclose(found.batch(x)["y"], np.linalg.inv(x), rtol=1e-12)
 
 
-def test_a_set_is_loaded_from_its_tapes_and_libraries(cache: Cache) -> None:
+def test_a_set_is_loaded_from_its_tapes_and_libraries(
+    cache: Cache, monkeypatch: pytest.MonkeyPatch
+) -> None:
     matrices = ca.MX.sym("x", 3, 3)
     whole = ca.Function("whole", [matrices], [ca.inv(matrices)], ["x"], ["y"])
     functions = {"scalars": every_operation(), "matrices": whole}
@@ -155,6 +158,12 @@ def test_a_set_is_loaded_from_its_tapes_and_libraries(cache: Cache) -> None:
     x, y = samples(np.random.default_rng(0), 7)
     for name, value in again["scalars"].batch(x, y).items():
         np.testing.assert_array_equal(value, made["scalars"].batch(x, y)[name])
+    other = SimpleNamespace(OPERATIONS=compiled_tape().OPERATIONS[::-1])
+    with monkeypatch.context() as patched:
+        # Numbers of operations mean others in another version of the module.
+        patched.setattr("codegen.build.compiled_tape", lambda: other)
+        with pytest.raises(AssertionError):
+            load_or_build("set", never, cache, lanes=1, taped=True)
     (tape,) = (path for path in cache.folder.iterdir() if path.suffix == ".npy")
     tape.write_bytes(tape.read_bytes()[:-8])
     with pytest.raises(AssertionError):
