@@ -18,8 +18,9 @@ from hybrid_opt.extras.bundles.job_file import (
     Export,
     chosen_step,
     gap_of,
-    stop_of,
+    timing_model,
 )
+from hybrid_opt.extras.bundles.stopping import stop_of
 from hybrid_opt.extras.bundles.targets import Target, missing_loads, target_for
 from hybrid_opt.job.compliance import (
     SKEWS,
@@ -404,4 +405,4 @@ def prepared(job: Job, name: str, options: BundleOptions) -> Export:
             step = chosen_step(job, target.steps, target.interpolation, k)
     sampled = sample_job(job, step)
     gap = None if k is None else gap_of(sampled, target.interpolation, k)
-    return Export(sampled, k, gap, stop_of(job))
+    return Export(sampled, k, gap, stop_of(job, timing_model(job.workcell)))

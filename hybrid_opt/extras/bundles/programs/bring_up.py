@@ -214,11 +214,11 @@ class Looks:
         fastest, found = max(job.speed(arm, s) for s in job.time), []
         for look in self.moving:
             forward = look.direction
-            told = min(max(look.s - forward * look.age[arm], 0.0), job.end)
-            if job.speed(arm, told) > FAST * fastest:
+            expected = min(max(look.s - forward * look.age[arm], 0.0), job.end)
+            if job.speed(arm, expected) > FAST * fastest:
                 low, high = sorted((-forward * BEHIND, forward * AHEAD))
-                at = job.coordinate(arm, look.q[arm], told, (low, high), 0.0)
-                found.append(forward * (told - at))
+                at = job.coordinate(arm, look.q[arm], expected, (low, high), 0.0)
+                found.append(forward * (expected - at))
         return median(found) if found else nan
 
     def contact(self, arm: int, lag: float) -> dict[str, float]:

@@ -317,8 +317,8 @@ class Machine:
         if self.clock.turning or self._gates[:1] != [self.clock.s]:
             return
         self._waited += dt
-        told = zip(self._inputs, seen.grip, strict=True)
-        late = [arm for arm, (told_of, on) in enumerate(told) if told_of and on is not self.grip]
+        both = zip(self._inputs, seen.grip, strict=True)
+        late = [arm for arm, (has, on) in enumerate(both) if has and on is not self.grip]
         if not late:
             self._gates.pop(0)
             self._next_gate()
@@ -398,7 +398,7 @@ class Machine:
             self.stop_time = limits.quick_stop if quick else limits.stop_time
             self.clock.turn(0.0, self.lead, self.stop_time)
 
-    def told(self) -> str:
+    def status(self) -> str:
         """Return a text that says in which state the job is, and how to continue."""
         where = f"{self.job.phase(self.clock.s)}, {self.clock.s:.3f} s"
         if self.state == "landing":
@@ -457,16 +457,16 @@ class Machine:
                 continue
             # Where the arm had to be when its posture was measured.
             since = self.clock.rate * seen.age[arm]
-            told = s - direction * self.lag - since
+            expected = s - direction * self.lag - since
             # Twice as far behind as is allowed, and a little ahead.
             far, near = -2.0 * direction * limits.behind, direction * limits.behind / 2.0
-            at = self.job.coordinate(arm, q, told, (min(far, near), max(far, near)))
+            at = self.job.coordinate(arm, q, expected, (min(far, near), max(far, near)))
             away = self.job.distance(arm, q, at)
             if away > most:
                 return f"{self._name(arm)} has left its path by up to {1e3 * away:.1f} mm"
             if self.job.speed(arm, s) > SLOW * self.job.fastest:
-                if direction * (told - at) > limits.behind:
-                    late = 1e3 * direction * (told - at)
+                if direction * (expected - at) > limits.behind:
+                    late = 1e3 * direction * (expected - at)
                     return f"{self._name(arm)} is {late:.0f} ms behind its reference"
                 coordinates.append(at + since)
         if len(coordinates) == 2:

@@ -216,10 +216,10 @@ class Stream:
         self.dropped += 1
         return None
 
-    def told(self) -> str:
+    def status(self) -> str:
         """Return a text that says in which state the job is."""
         strange = f" {self.dropped} packets were dropped, from other hosts or damaged."
-        return self.machine.told() + (strange if self.dropped else "")
+        return self.machine.status() + (strange if self.dropped else "")
 
     def tick(self, now: float) -> None:
         """Advance the job to the time `now` [s]."""
@@ -258,9 +258,9 @@ class Stream:
                 self.machine.resume(direction, self.seen(now))
             except Refused as error:
                 self.machine.hold(str(error))
-                print(self.told(), file=sys.stderr)
+                print(self.status(), file=sys.stderr)
         if before != self.machine.state:
-            print(self.told(), file=sys.stderr)
+            print(self.status(), file=sys.stderr)
 
     def answer(self, arm: int, number: int, now: float) -> bytes:
         """Encode the message that commands an arm's position, taken from the path ahead by the
@@ -398,7 +398,7 @@ def streamed(
         if stream.machine.state == "ready" and not word and now - begin > PATIENCE:
             raise Refused(f"{stream.missing}: is CarryEgm running in both tasks?")
         if stream.machine.state == "held" and stream.command == "leave":
-            print(f"left while {stream.told()}", file=sys.stderr)
+            print(f"left while {stream.status()}", file=sys.stderr)
             return 1
     return 0 if stream.machine.clock.s > 0.0 else BACK
 

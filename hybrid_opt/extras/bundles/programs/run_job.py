@@ -352,8 +352,8 @@ class Run:
         def ended(future: Any) -> None:
             done = future.result()
             if number == self._goals and done.status != GoalStatus.STATUS_SUCCEEDED:
-                told = done.result.error_string or f"status {done.status}"
-                self.fault = self.fault or f"{action} ended: {told}"
+                reason = done.result.error_string or f"status {done.status}"
+                self.fault = self.fault or f"{action} ended: {reason}"
                 self.lost = True
 
         return ended
@@ -435,7 +435,7 @@ class Run:
         if before == "landing" and machine.state == "running":
             self._go_on(1.0)
         if before != machine.state:
-            self.node.get_logger().info(machine.told())
+            self.node.get_logger().info(machine.status())
         if machine.state == "held" and self.command in ("continue", "back"):
             self._resume(1.0 if self.command == "continue" else -1.0)
 
@@ -489,7 +489,7 @@ class Run:
             self.machine.resume(direction, self.seen())
         except Refused as error:
             self.machine.hold(str(error))
-            self.node.get_logger().error(self.machine.told())
+            self.node.get_logger().error(self.machine.status())
         else:
             self._go_on(direction)
 
@@ -498,7 +498,7 @@ class Run:
             self._begin(direction)
         except Refused as error:
             self.machine.hold(str(error))
-            self.node.get_logger().error(self.machine.told())
+            self.node.get_logger().error(self.machine.status())
 
     def interrupt(self, *_: object) -> None:
         """Stop the job on Ctrl-C; if the job already holds, end the program."""
@@ -514,7 +514,7 @@ class Run:
                 self.spin(self.now() + PERIOD)
                 self.tick()
                 if machine.state == "held" and self.command == "leave":
-                    self.node.get_logger().error(f"left while {machine.told()}")
+                    self.node.get_logger().error(f"left while {machine.status()}")
                     return 1
         except BaseException:
             self.stop("run_job.py has failed")

@@ -210,7 +210,7 @@ class Cell:
         looks = self.stream.looks or Looks()
         self.part, self.is_empty = part, not word
         self.stream = Stream(part, self.config, looks)
-        assert self.run("done", "held") == "done", self.stream.machine.told()
+        assert self.run("done", "held") == "done", self.stream.machine.status()
         self.stream.machine.hold("it goes back")
         self.stream.command = "back"
         self.cycle()
@@ -251,7 +251,7 @@ class Cell:
         machine, begin = self.stream.machine, self.now
         while machine.state not in states and machine.clock.s <= middle:
             self.cycle()
-            assert self.now - begin < LONGEST, machine.told()
+            assert self.now - begin < LONGEST, machine.status()
         return machine.state
 
 
@@ -317,7 +317,7 @@ def test_faults_hold_both_arms(name: str, phase: str) -> None:
 @pytest.mark.parametrize("stiffness", [1e4, 3e4, 1e5, 3e5])
 def test_arms_as_stiff_as_measured_keep_their_force(stiffness: float) -> None:
     cell = Cell(stiffness, stiffness)
-    assert cell.run("done", "held") == "done", cell.stream.machine.told()
+    assert cell.run("done", "held") == "done", cell.stream.machine.status()
     s, force, wanted = (np.array([row[k] for row in cell.record]) for k in (1, 2, 3))
     held = (s > cell.job.pressed) & (s < cell.job.begin("release"))
     ratio, most = force[held] / wanted[held], force.max() / wanted.max()
@@ -398,7 +398,7 @@ def test_packets_of_others_and_broken_ones_are_dropped_and_counted() -> None:
     for data in (b"\xff" * 8, b"\x0b", sound[:-3], b"\x12\x05\x0a\x03\x09\x01"):
         assert stream.read(0, data, host) is None
     assert stream.dropped == 5
-    assert "5 packets were dropped" in stream.told()
+    assert "5 packets were dropped" in stream.status()
 
 
 def test_a_pause_of_the_computer_makes_no_arm_jump() -> None:

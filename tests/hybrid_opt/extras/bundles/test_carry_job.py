@@ -178,7 +178,7 @@ def test_postures_are_compared_when_they_were_measured(age: float) -> None:
     for late, state in ((0.0, "running"), (0.08, "held")):
         machine, shift = running(s), age + late
         ticks(machine, partial(_seen_late, shift, age))
-        assert machine.state == state, machine.told()
+        assert machine.state == state, machine.status()
 
 
 def test_both_arms_are_compared_at_one_time() -> None:
@@ -188,14 +188,14 @@ def test_both_arms_are_compared_at_one_time() -> None:
         machine,
         lambda s: Seen([posture(s - first)[0], posture(s - second)[1]], age=[first, second]),
     )
-    assert machine.state == "running", machine.told()
+    assert machine.state == "running", machine.status()
 
 
 def test_nothing_is_said_of_arms_that_are_silent() -> None:
     machine = running(job().begin("carry") + 2.0)
     ticks(machine, lambda s: Seen(posture(s), age=[0.0, 0.3]))
-    assert "right is silent" in machine.told()
-    assert "Both arms" not in machine.told()
+    assert "right is silent" in machine.status()
+    assert "Both arms" not in machine.status()
 
 
 def test_one_strange_look_stops_nothing() -> None:
@@ -233,7 +233,7 @@ def test_a_box_that_stands_early_is_let_go_there(above: float, state: str) -> No
         machine.tick(PERIOD / 2.0, seen)
         told.append([own.position(arm, machine.clock.s) for arm in (0, 1)])
         count += 1
-    assert machine.state == state, machine.told()
+    assert machine.state == state, machine.status()
     assert own.is_standing == (state == "done")
     steps = np.abs(np.diff(np.array(told, dtype=float), axis=0)).max(axis=(0, 2))
     assert steps.max() < 0.01, "no reference jumps"
@@ -301,7 +301,7 @@ def test_many_faults_in_all_phases() -> None:
             assert abs(machine.clock.rate) <= 1.0
             if machine.state in ("held", "done"):
                 break
-        told = f"{kind} at {when:.2f} s in {job().phase(when)}: {machine.told()}"
+        told = f"{kind} at {when:.2f} s in {job().phase(when)}: {machine.status()}"
         stops = kind in ("silent", "encoder", "asked")
         held_box = job().begin("lift") < when < job().begin("release") - 0.3
         moves = min(job().speed(a, when + d) for a in (0, 1) for d in (0.1, 0.4)) > 0.5 * (

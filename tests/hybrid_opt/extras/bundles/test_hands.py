@@ -7,6 +7,8 @@ import ast
 import csv
 import io
 import json
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -81,8 +83,19 @@ def with_lines(output: str, source: str, driver: Driver = DRIVER) -> Job:
     return replace(job, workcell=replace(job.workcell, robots=(robots[0], robots[1])))
 
 
+@contextmanager
+def planned_model() -> Iterator[None]:
+    """Use the timing model of the planned carry, which needs no compiler."""
+    rooms, model = ("bundle", "job_file"), planned()[1]
+    with ExitStack() as stack:
+        for room in rooms:
+            name = f"hybrid_opt.extras.bundles.{room}.timing_model"
+            stack.enter_context(patch(name, return_value=model))
+        yield
+
+
 def sheet(target: str, job: Job, step: float = 0.05) -> Export:
-    with patch("hybrid_opt.extras.bundles.job_file._model", return_value=planned()[1]):
+    with planned_model():
         found = prepared(job, target, BundleOptions(step=step, any_arm=True))
         assert found.holding.shape == found.sampled.q.shape
         return found
@@ -165,7 +178,7 @@ class Valves:
         self.on = on
 
     @property
-    def told(self) -> list[bool | None]:
+    def inputs(self) -> list[bool | None]:
         held = self.on if self.age >= self.delay else not self.on
         return [
             None if silent else held and not leaks
@@ -200,19 +213,19 @@ def test_outputs_are_on_until_the_box_stands_after_any_fault() -> None:
                 faults = faults[1:]
                 fault = "Ctrl-C" if kind in (0, 1) else ""
                 valves.leaks[arm], valves.silent[arm] = kind == 2, kind == 3
-            seen = Seen(grip=valves.told, fault=fault)
+            seen = Seen(grip=valves.inputs, fault=fault)
             machine.tick(LOOK, seen)
             valves.set(machine.grip, LOOK)
             lifted = float(np.interp(machine.clock.s, time, off)) > 1e-4
-            told = f"{number}: {machine.told()}"
-            assert machine.grip or not lifted, told
+            status = f"{number}: {machine.status()}"
+            assert machine.grip or not lifted, status
             if not leaves[0] < machine.clock.s < leaves[1]:
-                assert not machine.grip, told
+                assert not machine.grip, status
             if lifted and machine.state == "running":
-                assert all(valves.told) or kind in (2, 3), told
+                assert all(valves.inputs) or kind in (2, 3), status
             if machine.state == "held" and len(words):
                 fault, valves.leaks, valves.silent = "", [False, False], [False, False]
-                machine.resume(words[0], Seen(posture(machine.clock.s), grip=valves.told))
+                machine.resume(words[0], Seen(posture(machine.clock.s), grip=valves.inputs))
                 words, holds = words[1:], holds + 1
             elif machine.state == "held":
                 break
@@ -223,7 +236,7 @@ def ticked(machine: Machine, valves: Valves, most: float) -> float:
     """Run until it is held or done, at most so long; returns how long [s]."""
     now = 0.0
     while machine.state not in ("held", "done") and now < most:
-        machine.tick(PERIOD, Seen(posture(machine.clock.s), grip=valves.told))
+        machine.tick(PERIOD, Seen(posture(machine.clock.s), grip=valves.inputs))
         valves.set(machine.grip, PERIOD)
         now += PERIOD
     return now
@@ -244,7 +257,7 @@ def test_hands_that_never_hold_lift_nothing() -> None:
     assert machine.reason == "the hands of right do not hold after 3 s"
     assert machine.clock.s == read_job().begin("load")
     assert machine.grip
-    assert "keep their hands switched on" in machine.told()
+    assert "keep their hands switched on" in machine.status()
     # Back to where it stood: the hands let go before the arms leave.
     machine.resume(-1.0, Seen(posture(machine.clock.s), grip=[True, False]))
     ticked(machine, valves, 60.0)
@@ -496,7 +509,7 @@ def test_a_target_says_by_what_it_reaches_hands(name: str, tmp_path: Path) -> No
 
 def test_a_job_without_inputs_warns(tmp_path: Path) -> None:
     job = with_lines("", "")
-    with patch("hybrid_opt.extras.bundles.job_file._model", return_value=planned()[1]):
+    with planned_model():
         paths = export(job, "data", tmp_path, options=BundleOptions(step=0.1))
     document: Any = json.loads(paths[0].read_text("utf-8"))
     assert document["position_control"] == []

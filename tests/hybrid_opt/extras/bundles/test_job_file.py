@@ -31,8 +31,9 @@ from hybrid_opt.extras.bundles.job_file import (
     chosen_step,
     gap_of,
     pad_errors,
-    stop_of,
+    timing_model,
 )
+from hybrid_opt.extras.bundles.stopping import stop_of
 from hybrid_opt.job.compliance import TRACKED
 from hybrid_opt.job.records import SampledJob, sample_job
 from symbolic.errors import SettingsError
@@ -208,7 +209,7 @@ def test_a_stop_keeps_the_squeeze() -> None:
     """And needs the force of its deceleration: the worst of the job by hand, F = m (a - g), least
     forces with a Coulomb cone."""
     job, cell = rack_job(), rack().workcell
-    stop, worst = stop_of(job), 0.0
+    stop, worst = stop_of(job, timing_model(job.workcell)), 0.0
     for phase in job.held:
         # A bound: full speed and the largest slope of the rate at once, whole planned acceleration.
         slowed = 1.875 / stop.time * np.abs(phase.motion.rate[:, :3])
@@ -220,7 +221,7 @@ def test_a_stop_keeps_the_squeeze() -> None:
     assert stop.force_use <= min(1.0, 1.6 * worst / commanded)
     weak = [replace(p, force=replace(p.force, normal=0.4 * p.force.normal)) for p in job.phases]
     with pytest.raises(JobError, match=" % "):
-        stop_of(replace(job, phases=tuple(weak)))
+        stop_of(replace(job, phases=tuple(weak)), timing_model(job.workcell))
 
 
 def independent_gap(sampled: SampledJob, kind: str) -> float:
