@@ -131,7 +131,15 @@ def _waypoints(task: Task, x: ca.MX, handed: dict[str, ca.MX]) -> ca.MX:
 def _constraints(
     workcell: Workcell, values: dict[str, ca.MX], n: int, handed: dict[str, ca.MX]
 ) -> ca.MX:
-    """Build the constraint values (9, n) of n samples from the samples' quantities by name."""
+    """Build the values (9, n) of `CONSTRAINTS` at n samples. A value is at most 0 where the sample
+    satisfies the constraint.
+
+    Args:
+        workcell: cell with symbolic parameters.
+        values: quantities at the samples (rows, n) by name, at least `_CONSTRAINT_INPUTS`.
+        n: number of samples.
+        handed: the cell's symbolic parameters by name of their group.
+    """
     numbers = tile(select_parameters(handed, *workcell.robots, workcell.payload), n)
     inputs = [values[name] for name in _CONSTRAINT_INPUTS]
     return _constraint_function(workcell).map(n)(*inputs, *numbers)

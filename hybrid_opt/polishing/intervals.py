@@ -251,7 +251,8 @@ class IntervalValues:
         return value.reshape(-1) / whole, slope.reshape(-1, grid.moving) / whole
 
     def rows(self) -> Array:
-        """Return mix . quantities (points, k) for all k inequalities."""
+        """Return the left sides (points, k) of the k inequalities at every point: linear
+        combinations of the limited quantities, without unit, each at most its bound."""
         return np.asarray(self.value @ self._grid.kinds.mix.T)
 
     def curvature(self, weight: Array) -> tuple[NDArray[np.intp], Array]:
@@ -310,8 +311,16 @@ class IntervalValues:
 
 
 def _by_load(pressed: Mapping[str, Array], slope: Array) -> Array:
-    """Convert derivatives of the load (points, 6, ...) to derivatives of the forces (points, 2,
-    ...) that a convex program computes from it."""
+    """Apply the chain rule from the load to the normal forces of a convex program.
+
+    Args:
+        pressed: outputs of the program; `slope` (points, 2, 6) has the derivatives of both normal
+            forces by the load.
+        slope: (points, 6, n) derivatives of the load by n variables.
+
+    Returns:
+        Derivatives (points, 2, n) of both normal forces by the variables.
+    """
     return np.asarray(pressed["slope"] @ slope)
 
 

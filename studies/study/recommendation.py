@@ -355,15 +355,15 @@ def _force_table(
     found: Recommendation,
     advance: Advance,
 ) -> ForceTable:
-    """Compute the shortest durations of several paths at some commanded forces, among them that of
-    the recommended carry.
+    """Compute the table of shortest durations [s]: a row per path, a column per commanded force.
+
+    The forces are those of `table_forces` and that of the recommended carry. The rows are the
+    hand-made path, the recommended path, further paths, and the best of the front at each force.
 
     Args:
         cell: the drivable cell.
-        x: (k, n_var) carries from which the recommended one was chosen; they give the row of the
-            front.
-        others: further paths (n_path,) by name, in addition to the hand-made and the recommended
-            one.
+        x: (k, n_var) carries of the front, from which the recommended one was chosen.
+        others: path variables (n_path,) of each further path, by the path's name.
         found: the recommendation.
         advance: function that is called after each row.
     """

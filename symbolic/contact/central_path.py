@@ -526,8 +526,14 @@ class Equations:
         return moved + ca.horzcat(*map(self.balanced_change, pulls))
 
     def balanced_change(self, pull: ca.SX) -> ca.SX:
-        """Compute the change (n,) of the states for a right side `pull` (n,) of Newton's equations.
-        The change adds no load."""
+        """Solve Newton's equations for a change of the pads' forces that adds nothing to their sum.
+
+        Args:
+            pull: (n,) right side of the equations, an entry per entry of all patches' states.
+
+        Returns:
+            Change (n,) of the states, the wrenches and further variables of all patches.
+        """
         reduced, found = self._first.forward(pull[self._order]), ca.SX(*pull.shape)
         left = self._last.forward(ca.mtimes(self._by_free.T, reduced[-len(self._wrench) :]))
         wrenches = ca.mtimes(self._by_free, self._last.backward(left))

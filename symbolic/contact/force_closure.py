@@ -290,13 +290,13 @@ def _new_columns(matrix: Array, order: Sequence[int], least: float) -> list[int]
 
 
 def derive_grasp_numbers(workcell: Workcell, reach: float = 1.0) -> GraspNumbers:
-    """Compute the constants in the formulas of a grasp, without the states at rest (`rest`,
-    `rest_slopes` are None).
+    """Compute the matrices and the internal squeeze of a grasp by pads. The fields `rest` and
+    `rest_slopes`, which describe the box at rest, stay None.
 
     Args:
         workcell: cell with the pads.
-        reach: factor on the patch sizes; the internal squeeze lies within patches of this relative
-            size.
+        reach: the internal squeeze is chosen for patches smaller by this factor, so that its
+            pressure stays away from the rims.
 
     Raises:
         SettingsError: no internal squeeze exists.

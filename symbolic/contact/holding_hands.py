@@ -325,8 +325,8 @@ class HoldingHands(ContactModel):
         return np.full(commanded.shape, weakest)
 
     def raised(self, planned: Array, extra: Array, leader: int) -> Array:
-        """Compute the holding forces (n, 2) [N] after a rise; the hands of both arms get the same
-        force.
+        """Compute the holding forces (n, 2) [N] after a rise. Both columns are the raised force of
+        the robot that does not lead, because the hands of both arms hold with the same share.
 
         Args:
             planned: (n, 2) planned holding forces [N].

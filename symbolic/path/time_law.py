@@ -123,11 +123,13 @@ def _constant(task: Task, pose: ca.MX, rounding: ca.MX | None, handed: Handed) -
 
 
 def _step_time_function(task: Task, is_rounded: bool) -> ca.Function:
-    """Build the function of the duration of the step between two poses, start and end (6,) [s]
-    (paper Eqs. 23-24).
+    """Build the function that returns the duration [s] of the step from a start pose (6,) to an end
+    pose (6,) [m, rad] (paper Eqs. 23-24).
 
-    With `is_rounded` the third input is a relative width that smooths the maximum of translation
-    and rotation time.
+    Args:
+        task: task with the reference speeds.
+        is_rounded: True to smooth the maximum of translation and rotation time; the third input is
+            then the relative width of the smoothing.
     """
     start, end, given = ca.SX.sym("start", 6), ca.SX.sym("end", 6), sx_parameters(task).values()
     step = end - start

@@ -91,8 +91,9 @@ class Sampling:
         """Find bounds such that the wanted share of random candidates between them is feasible.
 
         One common factor of the half-widths is bisected. Between bisections the bounds move to the
-        mean of the feasible candidates, which allows wider bounds. The given carry is kept if it is
-        within the bounds, because carries in their middle are longer.
+        mean of the feasible candidates, which allows wider bounds. The initial carry of the result
+        is the given one if that lies within the bounds and is certified, else a carry between it
+        and the middle: the joints' path of the middle is longer.
 
         Args:
             carry: (n_var,) feasible decision vector.

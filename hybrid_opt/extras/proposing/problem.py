@@ -154,10 +154,10 @@ class Problem:
             lambda contacts: self.workcell({"contacts": contacts, "robots": anywhere}),
         )
         if not found:
-            told = (
-                "contacts: no free face of the box has room for hands whose tools stay outside it"
+            text = (
+                "contacts: no free face of the box has room for hands with their tools outside it"
             )
-            raise WorkcellError(str(self.source), (told,))
+            raise WorkcellError(str(self.source), (text,))
         return found
 
     def other_contacts(self) -> list[list[dict[str, Any]]]:
