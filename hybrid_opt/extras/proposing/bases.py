@@ -84,8 +84,8 @@ POSES = 33
 
 
 def base_choices(problem: Problem, spins: Array, rng: np.random.Generator) -> list[dict[str, Any]]:
-    """Propose bases for both robots, the most promising pair first. Both arms of one machine get
-    the same base.
+    """Propose bases for both robots, the most promising pair first. Both arms of a two-armed
+    machine get the same base.
 
     Args:
         problem: the problem.
@@ -93,7 +93,8 @@ def base_choices(problem: Problem, spins: Array, rng: np.random.Generator) -> li
         rng: generator of random postures.
 
     Returns:
-        Additions to the problem's tables, one dictionary per pair of bases.
+        Keys to add to the tables of the problem file (robots and contacts), one dictionary per pair
+        of bases.
     """
     found: list[tuple[float, dict[str, Any]]] = []
     for side in problem.sides():
@@ -105,7 +106,7 @@ def base_choices(problem: Problem, spins: Array, rng: np.random.Generator) -> li
 def _scored(
     problem: Problem, spins: Array, rng: np.random.Generator
 ) -> list[tuple[float, dict[str, Any]]]:
-    """Propose bases for both robots with the contacts of one problem.
+    """Propose bases for both robots, with the contact points that the problem has now.
 
     Args:
         problem: the problem, with contacts.
@@ -113,7 +114,7 @@ def _scored(
         rng: generator of random postures.
 
     Returns:
-        Pairs of a score, larger is better, and the additions to the problem's tables.
+        Pairs of a score, larger is better, and the keys to add to the tables of the problem file.
     """
     draft = draft_of(problem)
     scorer = PlaceScorer(problem, draft, spins, rng)
@@ -142,8 +143,12 @@ def _scored(
 
 
 def draft_of(problem: Problem) -> Workcell:
-    """Build the cell of a problem, with provisional bases and an automatic choice of the redundant
-    joints."""
+    """Build the workcell of a problem with provisional robot bases and automatically chosen
+    redundant joints.
+
+    Args:
+        problem: the problem, with contacts.
+    """
     sides = [_sideways(problem, arm) for arm in (0, 1)]
     near = [_base(problem, k, at + 0.4 * out, out) for k, (at, out) in enumerate(sides)]
     if problem.is_machine:
@@ -161,16 +166,16 @@ def _standing(problem: Problem, bases: list[Array]) -> dict[str, Any]:
 
 
 def _sideways(problem: Problem, arm: int) -> tuple[Array, Array]:
-    """Compute the middle between a contact's places at start and goal, and the direction away from
-    the box.
+    """Compute where a robot's contact is halfway between start and goal, and the direction away
+    from the box.
 
     Args:
         problem: the problem.
-        arm: index of the contact's robot.
+        arm: index of the robot.
 
     Returns:
-        The middle (3,) in the world [m], and the horizontal unit vector (3,) from the middle of the
-        box's path to it.
+        Mean (3,) of the contact's places at start and goal in the world [m]; and the horizontal
+        unit vector (3,) that points from the middle of the box's path to this mean.
     """
     point = np.append(np.array(problem.contacts[arm]["xyz"], dtype=float), 1.0)
     ends = [(box_placement(problem.orientation, pose) @ point)[:3] for pose in problem.poses]
@@ -182,14 +187,16 @@ def _sideways(problem: Problem, arm: int) -> tuple[Array, Array]:
 
 
 def _base(problem: Problem, arm: int, point: Array, outwards: Array) -> Array:
-    """Compute the base pose (6,) [m, rad] of a robot below a point, facing against `outwards`. The
-    height is the one in the file, else 0.
+    """Compute the base pose (6,) [m, rad] of a robot that stands below a point and faces the carry.
+
+    The height is the one in the problem file, else 0.
 
     Args:
         problem: the problem.
         arm: index of the robot.
         point: (3,) position in the world, of which x and y are used [m].
-        outwards: (3,) horizontal direction from the carry to the robot.
+        outwards: (3,) horizontal direction from the carry to the robot; the robot faces the
+            opposite way.
     """
     given = problem.data["robots"][arm].get("base", {}).get("xyz", [0.0, 0.0, 0.0])
     yaw = float(np.arctan2(-outwards[1], -outwards[0]))
@@ -207,8 +214,10 @@ def _places(problem: Problem, draft: Workcell, arm: int) -> list[Array]:
 
 
 def machine_places(problem: Problem, draft: Workcell) -> list[Array]:
-    """Propose base poses (6,) [m, rad] of a machine with two arms. The line through its shoulders
-    is parallel to the line through both contacts, and the arms can reach the carry.
+    """Propose base poses (6,) [m, rad] of a machine with two arms, from which the arms reach the
+    carry.
+
+    The line through the machine's shoulders is parallel to the line through both contacts.
 
     Args:
         problem: the problem, with contacts.
@@ -256,13 +265,13 @@ def _mean_reach(draft: Workcell, at: list[Array]) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class RankedBase:
-    """A base from which an arm follows the box.
+    """A base pose of one robot, with a score and the box paths that its arm can follow from there.
 
     Attributes:
         base: (6,) pose of the base in the world [m, rad].
         value: score; larger is better.
-        follows: (k,) True for each of the scorer's k box paths along which the arm can hold the
-            box.
+        follows: (k,) True for each of the k box paths of `PlaceScorer` along which the arm can hold
+            the box.
     """
 
     base: Array
@@ -299,8 +308,8 @@ class PlaceScorer:
         self._feet = [_feet(draft, arm) for arm in (0, 1)]
 
     def place(self, arm: int, base: Array) -> RankedBase | None:
-        """Evaluate a base of an arm. None if the robot collides there, or if the arm cannot hold
-        the box from start to goal.
+        """Evaluate a base of an arm. Return None if the robot collides there, or if the arm cannot
+        hold the box from start to goal.
 
         Args:
             arm: index of the arm.
@@ -318,22 +327,29 @@ class PlaceScorer:
         return RankedBase(base, value, self._followed(kinematics, holds))
 
     def _stands_free(self, arm: int, base: Array) -> bool:
-        """Return True if the robot's foot and fixed bodies, with its base at the pose (6,) [m,
-        rad], touch no body of the environment. A floor below the base does not count."""
+        """Return True if a robot's foot and fixed bodies touch no body of the environment.
+
+        A floor below the base does not count.
+
+        Args:
+            arm: index of the robot.
+            base: (6,) pose of its base in the world [m, rad].
+        """
         T = pose_matrix(base[:3] + np.array([0.0, 0.0, ABOVE]), base[3:])
         feet = tuple(piece.moved(T) for piece in self._feet[arm])
         return all(coal_distance(feet, pieces) > 0.0 for pieces in self._environment)
 
     def _followed(self, kinematics: ArmKinematics, holds: Sequence[Hold]) -> NDArray[np.bool_]:
-        """Find the box paths, of the scorer's k, along which an arm can hold the box with fixed
-        redundant joints.
+        """Find which box paths of this scorer an arm can follow while its redundant joints stay
+        fixed.
 
         Args:
             kinematics: the arm.
-            holds: holds of the arm, of which one has to work for a path.
+            holds: pad rotations with postures of the arm at start and goal; a path counts as
+                followed if one of them works.
 
         Returns:
-            (k,) True for paths that the arm can follow.
+            (k,) True for the paths that the arm can follow.
         """
         robot = self._draft.robots[kinematics.arm]
         k, m, _ = self._detours.shape
@@ -349,15 +365,15 @@ class PlaceScorer:
         return np.asarray((fine & (kept == m)).reshape(len(holds), k).any(axis=0))
 
     def _hidden(self, arm: int, shoulder: Array) -> float:
-        """Compute for how many of the two ends of the carry a body of the environment stands
-        between a shoulder and the robot's contact, seen from above.
+        """Compute at how many ends of the carry a body of the environment stands between an arm's
+        shoulder and its contact, seen from above.
 
         Args:
             arm: index of the arm.
             shoulder: (3,) position of the shoulder in the world [m].
 
         Returns:
-            0, 0.5 or 1.
+            Share of the two ends of the carry: 0, 0.5 or 1.
         """
         point = np.append(np.array(self._problem.contacts[arm]["xyz"], dtype=float), 1.0)
         hit = 0
@@ -378,8 +394,15 @@ class PlaceScorer:
 
 
 def _feet(draft: Workcell, arm: int) -> tuple[Piece, ...]:
-    """Return the solids that stand still with a robot's base, in the base frame: a cylinder as
-    foot, and the robot's fixed bodies. Fixed bodies of a machine belong to its first arm."""
+    """Return the solids that are fixed to a robot's base, in the base frame.
+
+    They are a cylinder as the robot's foot, and its fixed bodies. Fixed bodies of a machine with
+    two arms belong to its first arm.
+
+    Args:
+        draft: the cell.
+        arm: index of the robot.
+    """
     robot = draft.robots[arm]
     own = inverse(robot.T_world_base)
     standing = [
@@ -392,7 +415,7 @@ def _feet(draft: Workcell, arm: int) -> tuple[Piece, ...]:
 
 
 def shared_room(first: RankedBase, second: RankedBase) -> float:
-    """Score two bases by the share of box paths along which both arms can hold the box.
+    """Score two bases by the share of the tried box paths along which both arms can hold the box.
 
     Args:
         first: a base of the first robot.
@@ -406,8 +429,9 @@ def shared_room(first: RankedBase, second: RankedBase) -> float:
 
 
 def free_detours(workcell: Workcell, start: Array, goal: Array) -> Array:
-    """Compute paths of the box that are free of collisions: it is lifted, moved aside, along and
-    back, and lowered.
+    """Compute collision-free paths of the box that are not straight.
+
+    On each path the box is lifted, moved to a side, moved along, moved back and lowered.
 
     Args:
         workcell: the cell.

@@ -71,8 +71,9 @@ class Sampling:
             feasible at all samples.
         certain: function that returns True if the carry of one decision vector (n_var,) is feasible
             between its samples too.
-        unit: (n_var,) half-widths of the bounds, multiplied by one common factor [m, rad].
-        limits: (2, n_var) least lower and largest upper bounds [m, rad].
+        unit: (n_var,) half-widths of the bounds before the search multiplies all by one factor [m,
+            rad].
+        limits: (2, n_var) smallest allowed lower bounds and largest allowed upper bounds [m, rad].
         rng: generator of random candidates.
         low, high: wanted range of the share of random candidates that is feasible.
         out_of_time: function that returns True if no time is left.
@@ -91,9 +92,9 @@ class Sampling:
         """Find bounds such that the wanted share of random candidates between them is feasible.
 
         One common factor of the half-widths is bisected. Between bisections the bounds move to the
-        mean of the feasible candidates, which allows wider bounds. The initial carry of the result
-        is the given one if that lies within the bounds and is certified, else a carry between it
-        and the middle: the joints' path of the middle is longer.
+        mean of the feasible candidates, which allows wider bounds. The result's carry is the given
+        one if it lies within the bounds and is certified. Otherwise it is a carry between the given
+        one and the middle of the bounds.
 
         Args:
             carry: (n_var,) feasible decision vector.
@@ -160,14 +161,16 @@ class Sampling:
     def _judged(
         self, centre: Array, scale: float, most: int, wanted: tuple[float, float]
     ) -> tuple[Array, NDArray[np.bool_]]:
-        """Evaluate random candidates until the share of feasible ones is surely outside a range,
-        `most` candidates are done, or no time is left.
+        """Evaluate random candidates until it is nearly certain that the share of feasible ones
+        lies outside a range.
+
+        The evaluation also ends after `most` candidates, or if no time is left.
 
         Args:
             centre: (n_var,) middle of the bounds [m, rad].
             scale: factor of the half-widths.
             most: largest number of candidates.
-            wanted: least and largest wanted share of feasible candidates.
+            wanted: least and largest share of feasible candidates, the range.
 
         Returns:
             Candidates (n, n_var), and (n,) True for feasible ones.

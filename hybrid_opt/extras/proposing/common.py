@@ -36,17 +36,21 @@ MOVE_COST = 0.05
 def common_positions(
     arms: Sequence[ArmKinematics], query: HoldQuery, rng: np.random.Generator
 ) -> Iterator[Array | None]:
-    """Yield positions of the joints that move both arms, at the start and at the goal (2, k), the
-    most promising first. Yield None once if there are no such joints.
+    """Yield positions of the joints that move both arms, such as a torso, at the start and at the
+    goal.
 
-    The first pair is at zero, as far as the limits allow. A pair is promising if many random
-    postures of either arm reach the box at both ends, within joint limits and away from singular
-    postures, and if the joints move little.
+    The most promising positions come first; the very first are zero, as far as the limits allow.
+    Positions are promising if many random postures of each arm reach the box at both ends, within
+    joint limits and away from singular postures, and if the joints move little.
 
     Args:
         arms: both arms.
         query: box poses at start and goal, and rotations of the pads to try.
         rng: generator of positions and postures.
+
+    Yields:
+        (2, k) positions of the k joints at start and goal [rad or m]; None, once, if there are no
+        such joints.
     """
     if not arms[0].common:
         yield None

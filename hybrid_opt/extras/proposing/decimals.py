@@ -56,7 +56,11 @@ def pose_limits(pose: Array, orientation: Orientation) -> Array:
 
 def joint_limits(workcell: Workcell) -> Array:
     """Return the lower and upper limits (2, m) of a cell's m redundant joints [rad or m]. A joint
-    that moves both arms has the narrower limits of both robots."""
+    that moves both arms has the narrower limits of both robots.
+
+    Args:
+        workcell: the cell, whose task names the redundant joints.
+    """
     found = []
     for joint in workcell.task.redundant:
         driven = [
@@ -85,7 +89,7 @@ def limits_around(workcell: Workcell, waypoints: Array) -> Array:
 
 
 def rounded_outwards(bounds: Array, limits: Array) -> Array:
-    """Round bounds to the decimals of a file, lower bounds down and upper bounds up, but not beyond
+    """Round bounds to the decimals of a file: lower bounds down and upper bounds up, but not beyond
     limits.
 
     A decimal times `RECIPROCAL_UNIT` may differ from its integer by rounding: 1e4 times 2.8065 is
@@ -93,7 +97,10 @@ def rounded_outwards(bounds: Array, limits: Array) -> Array:
 
     Args:
         bounds: (2, ...) lower and upper bounds [m, rad].
-        limits: (2, ...) limits of the bounds [m, rad].
+        limits: (2, ...) smallest lower and largest upper bounds, of the same shape.
+
+    Returns:
+        (2, ...) rounded bounds.
     """
     low, high = np.round(RECIPROCAL_UNIT * bounds, COUNTED_DECIMALS)
     return np.array(
@@ -105,14 +112,18 @@ def rounded_outwards(bounds: Array, limits: Array) -> Array:
 
 
 def readable_turns(poses: Array, orientation: Orientation) -> Array:
-    """Return box poses whose angles beyond `ANGLE_LIMIT`, which a file may not contain, are turned
-    back by full turns. Rotation vectors are left unchanged.
+    """Turn back angles of box poses by full turns where they exceed `ANGLE_LIMIT`, the largest
+    angle in a file.
 
-    The reader unwraps angles along the path, so the path stays the same.
+    Rotation vectors stay unchanged. The reader of the file unwraps angles along the path, so the
+    path stays the same.
 
     Args:
         poses: (n, 6) box poses [m, rad].
         orientation: convention of the last three numbers of a pose.
+
+    Returns:
+        (n, 6) box poses [m, rad].
     """
     if orientation.is_vector:
         return poses

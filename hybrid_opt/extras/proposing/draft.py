@@ -63,17 +63,24 @@ class Draft:
         return self.waypoints[1:-1, :POSE_SIZE]
 
     def around(self, centre: Array) -> Draft:
-        """Return the draft with the waypoints of another decision vector `centre` (n_var,)."""
+        """Return this draft with its free waypoints replaced by those of a decision vector.
+
+        Args:
+            centre: (n_var,) decision vector [m, rad].
+        """
         m = len(self.workcell.task.redundant)
         return replace(self, waypoints=_as_waypoints(centre, self.waypoints, m))
 
 
 def changes(problem: Problem, found: Draft) -> dict[str, Any]:
-    """Return what a problem file lacks to be a workcell file with a found path: new keys by table.
+    """Return the keys that turn a problem file into a workcell file with a found path.
 
     Args:
         problem: the problem.
         found: the path, with its cell.
+
+    Returns:
+        New keys and values by table of the file: `task`, `robots` and `contacts`.
     """
     poses = readable_turns(found.waypoints[:, :POSE_SIZE], found.workcell.task.orientation)
     waypoints = np.hstack([poses, found.waypoints[:, POSE_SIZE:]])
@@ -120,14 +127,14 @@ def changes(problem: Problem, found: Draft) -> dict[str, Any]:
 
 
 def decision_bounds(workcell: Workcell) -> tuple[Array, Array]:
-    """Compute how far bounds of the decision vector may reach.
+    """Compute the widths and the limits with which bounds of the decision vector are searched.
 
     Args:
         workcell: the cell, with the hand-made trajectory.
 
     Returns:
-        Half-widths (n_var,) of bounds, to be multiplied by one common factor [m, rad], and limits
-        (2, n_var) that the bounds must not exceed.
+        Half-widths (n_var,) of bounds, to be multiplied by one common factor [m, rad]; and limits
+        (2, n_var), the smallest lower and the largest upper bounds.
     """
     task, n = workcell.task, len(workcell.task.waypoints)
     poses = [pose_limits(pose, task.orientation) for pose in task.initial]
@@ -140,7 +147,7 @@ def _boxes(found: Draft, waypoints: Array) -> Array:
     """Compute lower and upper bounds (2, n, 6 + m) of waypoints, rounded to the decimals of a file.
 
     Args:
-        found: the draft; without bounds of its own, a fixed range about each waypoint is taken.
+        found: the draft. If it has no bounds, each waypoint gets bounds at a fixed distance.
         waypoints: (n, 6 + m) box poses [m, rad] and redundant joints [rad or m].
     """
     bounds = np.array([waypoints - DRAFT_ROOM, waypoints + DRAFT_ROOM])
@@ -151,12 +158,12 @@ def _boxes(found: Draft, waypoints: Array) -> Array:
 
 
 def _as_waypoints(x: Array, waypoints: Array, m: int) -> Array:
-    """Replace all free values of waypoints by those of a decision vector: the inner box poses and
-    every redundant joint.
+    """Build the waypoints (n, 6 + m) of a decision vector, whose values replace the inner box poses
+    and all redundant joints of given waypoints.
 
     Args:
         x: (n_var,) decision vector [m, rad].
-        waypoints: (n, 6 + m) waypoints, whose first and last box poses are kept [m, rad].
+        waypoints: (n, 6 + m) given waypoints, whose first and last box poses are kept [m, rad].
         m: number of redundant joints.
     """
     n = len(waypoints)

@@ -47,14 +47,15 @@ Entry = dict[str, Any]
 
 
 def pattern_entry(entry: Entry, thickness: float) -> Entry:
-    """Return the entry of a contact with its hands placed relative to the first one, which is at
-    the origin with z into the payload.
+    """Return a contact's file entry with its hands placed relative to the first hand.
+
+    The first hand is at the origin with its z axis into the payload.
 
     Args:
         entry: entry of the contact in the problem file, without `xyz`; `xyz` of the hands in
             `further` is already relative to the first hand.
-        thickness: thickness of the payload, for the opposite finger of a gripper without `further`
-            [m].
+        thickness: thickness of the payload [m]. It places the opposite finger of a gripper that has
+            no `further`.
     """
     further = entry.get("further", [])
     if entry.get("kind") == "fingers" and not further:
@@ -89,9 +90,10 @@ def hand_places(
     along: Array,
     workcell: Callable[[list[Entry]], Workcell],
 ) -> list[list[Entry]]:
-    """Propose places of both arms' hands on a box. Places come first where the box at rest needs
-    the smallest share of the hands' holding force. Places at which the arms would cross are left
-    out.
+    """Propose places of both arms' hands on a box.
+
+    Places come first if the box at rest needs a small share of the hands' holding force. Places at
+    which the arms would cross are left out.
 
     Args:
         patterns: contact of each arm, with its hands placed relative to the first one as by
@@ -99,10 +101,10 @@ def hand_places(
         size: (3,) edges of the box [m].
         rotations: (n, 3, 3) R_world_box at the ends of the carry.
         along: (3,) vector from robot 2 to robot 1 in the box frame; zeros if unknown.
-        workcell: function that reads the cell with the given entries of both contacts.
+        workcell: function that reads the cell with given file entries of both contacts.
 
     Returns:
-        For each proposal the file entries of both contacts.
+        File entries of both contacts, for each proposal.
     """
     pairs = [
         (first, second)
@@ -123,11 +125,11 @@ def hand_places(
 
 
 def _with_tools_outside(cell: Workcell, pairs: Sequence[Both]) -> Iterator[Both]:
-    """Yield the pairs of contacts with which no tool enters the payload.
+    """Yield those pairs of contacts at which neither robot's tool enters the payload.
 
     Args:
-        cell: the cell, whose contacts are replaced.
-        pairs: contacts of both arms.
+        cell: the cell; its own contacts only tell where each pad is on its arm.
+        pairs: contacts of both arms, one pair per place.
     """
     bodies, arms = collision_bodies(cell), [arm_geometry(cell, arm) for arm in (0, 1)]
     T_joint_pad = [
@@ -143,9 +145,10 @@ def _with_tools_outside(cell: Workcell, pairs: Sequence[Both]) -> Iterator[Both]
 
 
 def _pairs(patterns: Sequence[Contact], size: Array, rotations: Array) -> Iterator[Both]:
-    """Yield contacts of both arms on faces of a box that are free at both ends of the carry. Cups
-    and magnets are placed on opposite faces or on one face, fingers around the edges of the
-    thinnest side.
+    """Yield contacts of both arms on faces of a box that are free at both ends of the carry.
+
+    Cups and magnets are placed on opposite faces or together on one face; fingers around the edges
+    of the thinnest side.
 
     Args:
         patterns: contact of each arm, with its hands placed relative to the first one.
@@ -179,15 +182,15 @@ def _pairs(patterns: Sequence[Contact], size: Array, rotations: Array) -> Iterat
 def _placed(
     pattern: Contact, outward: Array, size: Array, turn: float, place: Array
 ) -> Contact | None:
-    """Return a contact with its hands on a face of a box, None if the face has too little room.
+    """Return a contact with its hands on a face of a box; None if the face has too little room.
 
     Args:
         pattern: contact with its hands placed relative to the first one.
         outward: (3,) outward normal of the face in the box frame, along one of its axes.
         size: (3,) edges of the box [m].
         turn: rotation of the hands about the normal of the face [rad].
-        place: (2,) place of the hands on the face between its middle, 0, and its edges, -1 and 1,
-            along the face's two axes.
+        place: (2,) place of the hands on the face, along the face's two axes: 0 is its middle, -1
+            and 1 are its edges.
     """
     face = pad_rotation(-outward, 0.0)
     rotation = face @ pose_matrix(np.zeros(3), np.array([0.0, 0.0, turn]))[:3, :3]
@@ -203,7 +206,7 @@ def _placed(
 
 
 def _reach(pad: Contact) -> Array:
-    """Compute half the extent (2,) of a pad's patch along the x and y axes of its frame [m]."""
+    """Compute half the extent (2,) of a pad's patch along the x and y axes of the pad frame [m]."""
     if pad.half_sides is None:
         return np.full(2, pad.patch_radius)
     return np.asarray(np.abs(pad.T_box_pad[:2, :2]) @ pad.half_sides)
@@ -214,7 +217,12 @@ def _points(contact: Contact) -> Array:
 
 
 def _overlap(one: Contact, other: Contact) -> bool:
-    """Return True if the circles around the patches of two contacts intersect."""
+    """Return True if the circles around the patches of two contacts intersect.
+
+    Args:
+        one: a contact, with all its hands.
+        other: another contact, with all its hands.
+    """
     apart = np.linalg.norm(_points(one)[:, None] - _points(other), axis=2)
     return bool(apart.min() < one.patch_radius + other.patch_radius)
 

@@ -35,9 +35,11 @@ GUIDE_POSES = 25
 
 
 def possible_spins(contact: Contact, spins: Array) -> Array:
-    """Select rotations of an arm's pads about their normals with which the pads cover the same
-    patches as before: all for one round pad, half turns for a rectangular pad, quarter turns for a
-    square array of cups.
+    """Select rotations of an arm's pads about their normals that leave the covered patches
+    unchanged.
+
+    These are all rotations for one round pad, half turns for a rectangular pad, and quarter turns
+    for a square array of cups.
 
     Args:
         contact: contact of the arm.
@@ -51,11 +53,11 @@ def possible_spins(contact: Contact, spins: Array) -> Array:
 
 
 def clear_spins(query: HoldQuery, kinematics: ArmKinematics, spins: Array) -> Array:
-    """Select rotations of an arm's pads about their normals with which hand, tool and pad neither
-    enter the payload nor collide with fixed bodies, at start and goal. If none is clear, all are
-    returned.
+    """Select rotations of an arm's pads about their normals at which hand, tool and pad are free of
+    collisions, at start and goal.
 
-    Within a shelf few rotations are clear. A search then tries only these.
+    They must neither enter the payload nor collide with fixed bodies. If no rotation is free, all
+    are returned. Within a shelf few rotations are free, and a search then tries only these.
 
     Args:
         query: box poses at start and goal.
@@ -155,12 +157,13 @@ LIMIT_MARGIN = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Hold:
-    """Postures of one arm at start and goal between which it can hold the box all the way.
+    """A rotation of one arm's pad, and postures of the arm at start and goal between which it can
+    hold the box all the way.
 
     Attributes:
         spin: rotation of the pad about its normal, in addition to the file's [rad].
-        q_start, q_goal: (joints,) postures at start and goal, connected along one of `GUIDES` [rad
-            or m].
+        q_start, q_goal: (joints,) postures at start and goal, connected along one of the box paths
+            `GUIDES` [rad or m].
         score: larger is better.
     """
 
@@ -172,7 +175,7 @@ class Hold:
 
 @dataclass
 class HoldSearch:
-    """Result of the search for the holds of one arm, and counts that explain a failure.
+    """Result of the search for the holds (`Hold`) of one arm, and counts that explain a failure.
 
     Attributes:
         holds: the holds, best first.
@@ -229,6 +232,9 @@ def find_holds(query: HoldQuery, kinematics: ArmKinematics, rng: np.random.Gener
         query: box poses and effort of the search.
         kinematics: the arm.
         rng: generator of random postures.
+
+    Returns:
+        The holds, pairs of a start and a goal posture, with counts that explain a failure.
     """
     finder = _Finder(query, kinematics, rng)
     found, contact = finder.found, kinematics.workcell.contacts[kinematics.arm]
@@ -248,7 +254,7 @@ def find_holds(query: HoldQuery, kinematics: ArmKinematics, rng: np.random.Gener
 
 
 class _Finder:
-    """The search for one arm's holds.
+    """The search for one arm's holds, its postures at start and goal.
 
     Attributes:
         found: the result so far.
@@ -262,14 +268,14 @@ class _Finder:
         self._orientation = kinematics.workcell.task.orientation
 
     def start_postures(self, T_box_joint: Sequence[Array]) -> tuple[Array, NDArray[np.intp]]:
-        """Find distinct postures that hold the box at the start.
+        """Find distinct postures that hold the box at the start, for each tried rotation of the
+        pad.
 
         Args:
-            T_box_joint: pose (4, 4) of the last joint in the box frame, for each rotation of the
-                pad.
+            T_box_joint: pose (4, 4) of the arm's last joint in the box frame, for each rotation.
 
         Returns:
-            Postures (n, joints) [rad or m], and the index (n,) of each one's entry in
+            Postures (n, joints) [rad or m], and the index (n,) of each posture's rotation in
             `T_box_joint`.
         """
         kinematics, found, start = self.kinematics, self.found, self.query.start
@@ -329,7 +335,9 @@ class _Finder:
 
     def lead(self, spin: Array, T_box_joint: Array, q: Array) -> None:
         """Move the arm from each posture along guides, paths of the box to the goal, until enough
-        postures arrive. Each that arrives without collision becomes a hold.
+        postures arrive.
+
+        A posture that arrives without collision is added to the found holds.
 
         Args:
             spin: (n,) rotation of the pad about its normal, for each posture [rad].
@@ -359,15 +367,18 @@ class _Finder:
             waiting = np.delete(waiting, arrived)
 
     def _followed(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
-        """Move the arm from n postures along m given poses of its last joint.
+        """Move the arm from n postures along given poses of its last joint.
+
+        Of an arm with redundant joints, about half of the postures keep these joints; the others
+        move them at an even rate to random positions.
 
         Args:
-            targets: (m, n, 4, 4) poses of the last joint in the world.
+            targets: (m, n, 4, 4) poses of the last joint in the world, m for each posture.
             q: (n, joints) postures at the first pose [rad or m].
 
         Returns:
             Indices of the postures that reach the last pose; joint paths (m, n, joints) [rad or m];
-            scores (n,).
+            scores (n,), larger is better.
         """
         kinematics, redundant = self.kinematics, list(self.kinematics.redundant)
         ends = None
@@ -415,16 +426,19 @@ class _Finder:
         return f"{joint} is at its limit there"
 
     def _resolved(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
-        """Move the arm as `_followed` does, with redundant joints chosen anew at every pose. Limits
-        count at the last pose only, because the planned path may differ from these paths.
+        """Move the arm from n postures along given poses of its last joint, with redundant joints
+        chosen anew at every pose.
+
+        Joint limits count at the last pose only, because the planned path may differ from these
+        paths.
 
         Args:
-            targets: (m, n, 4, 4) poses of the last joint in the world.
+            targets: (m, n, 4, 4) poses of the last joint in the world, m for each posture.
             q: (n, joints) postures at the first pose [rad or m].
 
         Returns:
             Indices of the postures that reach the last pose; joint paths (m, n, joints) [rad or m];
-            scores (n,).
+            scores (n,), larger is better.
         """
         ends = None
         if self.query.common is not None:
@@ -438,25 +452,30 @@ class _Finder:
         return arrived, path, self._score(path, room, measure)
 
     def _place_common(self, ends: Array) -> None:
-        """Overwrite, in place, the joints that also move the other arm with their positions at the
-        goal.
+        """Set the joints that also move the other arm to their given positions at the goal, in
+        place.
 
         Args:
-            ends: (n, redundant) positions of the redundant joints at the goal [rad or m].
+            ends: (n, redundant) positions of the redundant joints at the goal [rad or m], of which
+                these joints' columns are overwritten.
         """
         if self.query.common is not None:
             columns = [self.kinematics.redundant.index(k) for k in self.kinematics.common]
             ends[:, columns] = self.query.common[1]
 
     def _room(self, path: Array) -> Array:
-        """Compute the distance of each posture from the nearest joint limit, (m, n) [rad or m],
-        along n joint paths (m, n, joints)."""
+        """Compute the distance (m, n) of each posture from its nearest joint limit [rad or m];
+        negative beyond a limit.
+
+        Args:
+            path: (m, n, joints) n joint paths of m postures each [rad or m].
+        """
         beyond = np.minimum(path - self.kinematics.lower, self.kinematics.upper - path)
         return np.asarray(beyond.min(axis=2))
 
     def _score(self, path: Array, room: Array, measure: Array) -> Array:
-        """Score n joint paths: far from limits and singular postures, with ends near each other, is
-        better.
+        """Score n joint paths. Paths far from joint limits and singular postures, with ends near
+        each other, score better.
 
         Args:
             path: (m, n, joints) joint paths [rad or m].
@@ -488,12 +507,15 @@ def manipulability_hint(kinematics: ArmKinematics, found: str) -> str:
 
 
 def _diverse(holds: Sequence[Hold], compared: int) -> list[Hold]:
-    """Sort holds such that those which differ much from all before come first. Of nearly equal
+    """Sort holds such that holds which differ much from all before come first. Of nearly equal
     holds only the first is kept.
 
     Args:
-        holds: the holds, best first.
+        holds: the holds (pad rotation, start and goal posture), best first.
         compared: number of joints, counted from the base, by which start postures are compared.
+
+    Returns:
+        The kept holds.
     """
     first: list[Hold] = []
     later: list[Hold] = []

@@ -111,8 +111,12 @@ class ArmKinematics:
         return np.array([np.maximum(self.lower, -np.pi), np.minimum(self.upper, np.pi)])
 
     def drawn(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw `count` random postures (count, joints), uniform between the limits of `span` [rad
-        or m]."""
+        """Draw random postures (count, joints) [rad or m], uniform between the limits of `span`.
+
+        Args:
+            count: number of postures.
+            rng: generator of the postures.
+        """
         low, high = self.span
         return rng.uniform(low, high, (count, len(low)))
 
@@ -284,8 +288,13 @@ class ArmKinematics:
 
 
 def rotate_about_normal(contact: Contact, spin: float) -> Contact:
-    """Return a contact whose pad is rotated about its normal by an angle `spin` [rad]. Several pads
-    of one contact rotate together about their middle."""
+    """Return a contact whose pad is rotated about its normal. Several pads of one contact rotate
+    together about their middle.
+
+    Args:
+        contact: the contact.
+        spin: angle of the rotation [rad].
+    """
     turn = pose_matrix(np.zeros(3), np.array([0.0, 0.0, spin]))
     if not contact.further:
         return replace(contact, T_box_pad=contact.T_box_pad @ turn)
@@ -298,6 +307,7 @@ def moved(contact: Contact, motion: Array) -> Contact:
     """Return a contact with all its pads moved by a transform.
 
     Args:
+        contact: the contact.
         motion: (4, 4) transform in the box frame, applied to each T_box_pad from the left.
     """
     further = tuple(replace(pad, T_box_pad=motion @ pad.T_box_pad) for pad in contact.further)
@@ -305,8 +315,13 @@ def moved(contact: Contact, motion: Array) -> Contact:
 
 
 def covers_the_same(contact: Contact, other: Contact) -> bool:
-    """Return True if every pad of one contact has a pad of the other that covers the same patch.
-    The order of the pads does not count."""
+    """Return True if two contacts cover the same patches of the box, whatever the order of their
+    pads.
+
+    Args:
+        contact: a contact, each of whose pads needs a partner in `other`.
+        other: contact whose pads are compared.
+    """
 
     def alike(a: Contact, b: Contact) -> bool:
         apart = np.abs(a.T_box_pad[:3, 2:] - b.T_box_pad[:3, 2:]).max()
@@ -318,8 +333,14 @@ def covers_the_same(contact: Contact, other: Contact) -> bool:
 
 
 def shoulder_positions(robots: tuple[Robot, Robot]) -> Array:
-    """Compute the shoulder position of each arm in the world (2, 3) [m]: the origin of the first
-    joint that moves this arm only. All joints are at the middle of their ranges."""
+    """Compute the shoulder position of each arm in the world (2, 3) [m], with all joints at the
+    middle of their ranges.
+
+    The shoulder is the origin of the first joint that moves this arm only.
+
+    Args:
+        robots: both robots.
+    """
     found = []
     for robot in robots:
         model = arm_model(robot)
@@ -331,7 +352,11 @@ def shoulder_positions(robots: tuple[Robot, Robot]) -> Array:
 
 
 def has_wrist_spin(kinematics: ArmKinematics) -> bool:
-    """Return True if the arm's last joint rotates the pad about its normal and is not redundant."""
+    """Return True if the arm's last joint rotates the pad about its normal and is not redundant.
+
+    Args:
+        kinematics: the arm, with its contact.
+    """
     geometry, contact = kinematics.geometry, kinematics.workcell.contacts[kinematics.arm]
     T_joint_pad = geometry.T_joint_box @ contact.T_box_pad
     axis = geometry.axes[-1]
@@ -342,7 +367,12 @@ def has_wrist_spin(kinematics: ArmKinematics) -> bool:
 
 
 def _turns(axis: Array, angle: Array) -> Array:
-    """Compute rotation matrices (n, 3, 3) for angles (n,) about a unit axis (3,)."""
+    """Compute rotation matrices (n, 3, 3) about one axis.
+
+    Args:
+        axis: (3,) unit axis.
+        angle: (n,) angles [rad].
+    """
     K = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
     sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
     return np.asarray(np.eye(3) + sine * K + (1.0 - cosine) * (K @ K))

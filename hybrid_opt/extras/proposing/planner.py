@@ -64,7 +64,7 @@ class ChainConfiguration:
 
 
 class _Follower:
-    """One arm that follows the box with a fixed hold, with Pinocchio's numeric model."""
+    """Numeric kinematics by Pinocchio of an arm that follows the box with a fixed pad rotation."""
 
     def __init__(self, many: ArmKinematics, hold: Hold, model: pin.Model) -> None:
         robot = many.workcell.robots[many.arm]
@@ -126,8 +126,10 @@ class _Follower:
 
 
 class ClosedChain:
-    """Both arms with the box between them, each with a fixed hold. Not safe to share between
-    threads.
+    """Kinematics and collision checks of both arms with the box between them, while each pad stays
+    fixed on the box.
+
+    Threads must not share an object.
 
     Attributes:
         judge: checker of collisions.
@@ -148,7 +150,7 @@ class ClosedChain:
         Args:
             workcell: the cell, with chosen redundant joints.
             judge: checker of collisions.
-            holds: hold of each arm.
+            holds: hold of each arm, of which the rotation of the pad is used.
             models: Pinocchio model of each arm (`symbolic.read.arms.arm_model`).
         """
         self.judge, self.looked = judge, 0
@@ -309,7 +311,11 @@ class ClosedChain:
         return found if len(found) == len(path) else None
 
     def _free(self, places: list[ChainConfiguration]) -> int:
-        """Return the number of configurations `places` before the first one that collides."""
+        """Count the configurations before the first one that collides; all if none does.
+
+        Args:
+            places: configurations along a path.
+        """
         if not places:
             return 0
         pose = np.array([place.extended[:POSE_SIZE] for place in places])
@@ -331,18 +337,25 @@ def metric_weights(size: int) -> Array:
 
 
 def distance(first: Array, second: Array) -> float:
-    """Compute the distance between two box poses that are followed by m redundant joints, each (6 +
-    m,), weighted by `metric_weights` [m]."""
+    """Compute the distance [m] between two box poses with redundant joints, weighted by
+    `metric_weights`.
+
+    Args:
+        first: (6 + m,) box pose [m, rad] followed by the m redundant joints [rad or m].
+        second: (6 + m,) another such vector.
+    """
     return float(np.linalg.norm(metric_weights(len(first)) * (second - first)))
 
 
 def straight(first: Array, second: Array) -> Array:
-    """Interpolate linearly between two box poses that are followed by m redundant joints, each (6 +
-    m,) [m, rad; rad or m].
+    """Interpolate linearly between two box poses with redundant joints.
+
+    Args:
+        first: (6 + m,) box pose [m, rad] followed by the m redundant joints [rad or m].
+        second: (6 + m,) another such vector.
 
     Returns:
-        (n, 6 + m) poses with redundant joints, both ends included, neighbours at most `PATH_STEP`
-        apart.
+        (n, 6 + m) vectors, both ends included, neighbours at most `PATH_STEP` apart.
     """
     n = max(int(np.ceil(distance(first, second) / PATH_STEP)), 1)
     return np.asarray(np.linspace(first, second, n + 1))
@@ -377,13 +390,15 @@ branch."""
 
 @dataclass(frozen=True)
 class AffineSubspace:
-    """The box poses and redundant joints among which a path is searched: origin + directions @ y
-    with bounded y.
+    """A bounded set in which a path is searched: the vectors origin + directions @ y with bounds of
+    y.
+
+    A vector is a box pose followed by m redundant joints. A coordinate y has d entries.
 
     Attributes:
         origin: (6 + m,) box pose [m, rad] followed by the m redundant joints [rad or m].
-        directions: (6 + m, d) basis, scaled such that the Euclidean distance between two y equals
-            the `distance` of what they stand for.
+        directions: (6 + m, d) basis. Its scale makes the Euclidean distance between two coordinates
+            equal to the `distance` of their vectors.
         lower, upper: (d,) bounds of y [m].
         range: longest motion by which the planner's trees grow [m].
     """
@@ -395,13 +410,20 @@ class AffineSubspace:
     range: float
 
     def extended(self, y: Array) -> Array:
-        """Compute the box pose followed by m redundant joints (6 + m,) at coordinates y (d,) of the
-        subspace [m]."""
+        """Compute the box pose followed by m redundant joints (6 + m,) at a coordinate of the
+        subspace.
+
+        Args:
+            y: (d,) coordinate [m].
+        """
         return np.asarray(self.origin + self.directions @ y)
 
     def coordinates(self, extended: Array) -> Array:
-        """Compute the coordinates (d,) [m] in the subspace of a box pose followed by m redundant
-        joints (6 + m,)."""
+        """Compute the coordinate (d,) [m] in the subspace of a box pose with redundant joints.
+
+        Args:
+            extended: (6 + m,) box pose [m, rad] followed by the m redundant joints [rad or m].
+        """
         return np.asarray(np.linalg.pinv(self.directions) @ (extended - self.origin))
 
 
@@ -425,14 +447,14 @@ class Corridor:
 
 
 def search_subspace(start: Array, goal: Array, stray: Corridor, limits: Array) -> AffineSubspace:
-    """Compute the set of box poses and redundant joints within which a path from start to goal is
+    """Compute the set of box poses and redundant joints in which a path from start to goal is
     searched.
 
     Args:
         start, goal: (6 + m,) box pose [m, rad] followed by the m redundant joints [rad or m].
         stray: allowed deviation from the straight motion; redundant joints may deviate
             `REDUNDANT_ASIDE` times as far.
-        limits: (m, 2) limits of the redundant joints [rad or m].
+        limits: (m, 2) lower and upper limit of each redundant joint [rad or m].
     """
     size, weight, tilt = len(start), metric_weights(len(start)), stray.tilt
     aside = np.full(size, stray.aside)
@@ -472,12 +494,18 @@ beginning with the end itself."""
 
 
 def retreats(chain: ClosedChain, ends: tuple[ChainConfiguration, ChainConfiguration]) -> Retreats:
-    """Find straight collision-free motions of the box out of its start and its goal, for instance
-    out of a shelf. Directions are the world's axes and the diagonals between them.
+    """Find straight collision-free motions of the box out of its start and out of its goal, for
+    instance out of a shelf.
+
+    Directions are the world's axes and the diagonals between them.
 
     Args:
         chain: both arms with a fixed hold each.
         ends: configurations at the start and at the goal.
+
+    Returns:
+        For the start, then for the goal: a list of configurations along each direction, from the
+        end itself to the last one before a collision.
     """
     ways = DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1)[:, None]
     begins = [place for place in ends for _ in ways]
@@ -492,16 +520,19 @@ def retreats(chain: ClosedChain, ends: tuple[ChainConfiguration, ChainConfigurat
 def straight_paths(
     chain: ClosedChain, out: Retreats, box: PayloadSceneChecker
 ) -> Iterator[list[ChainConfiguration]]:
-    """Yield collision-free paths of three straight motions: a retreat from the start, a motion
-    across, and the reverse of a retreat from the goal. Shorter paths come first.
+    """Yield collision-free paths of three straight motions, shorter ones first.
 
-    Each path is given by its four corners. The two retreats have the same direction, or two
-    different axes of the world; each such pair of directions gives at most one path.
+    The motions are a retreat from the start, a motion across, and the reverse of a retreat from the
+    goal. Both retreats have the same direction, or two different axes of the world; each such pair
+    of directions gives at most one path.
 
     Args:
         chain: both arms with a fixed hold each.
-        out: retreats from start and goal.
+        out: result of `retreats`: configurations along straight motions out of start and goal.
         box: collision checker of the box alone.
+
+    Yields:
+        Configurations at the four corners of a path.
     """
     ways: dict[tuple[bytes, bytes], tuple[float, tuple[int, int], list[ChainConfiguration]]] = {}
     axes = np.flatnonzero(np.count_nonzero(DIRECTIONS, axis=1) == 1)
@@ -536,16 +567,20 @@ def plan(
     out_of_time: Callable[[], bool],
     seed: int,
 ) -> list[ChainConfiguration] | None:
-    """Find the corners of a collision-free path from start to goal by the planner RRT-Connect; None
-    if no path is found.
+    """Find a collision-free path from start to goal by the planner RRT-Connect; None if no path is
+    found.
 
     Args:
         chain: both arms with a fixed hold each.
-        out: retreats from start and goal, whose ends are further roots of the planner's trees.
+        out: result of `retreats`: configurations along straight motions out of start and goal. They
+            become further roots of the planner's trees.
         room: box poses and redundant joints that the path may use.
         most: largest number of configurations that may be checked.
         out_of_time: function that returns True if no time is left.
         seed: seed of the planner, at least 1.
+
+    Returns:
+        Configurations at the corners of the path; between them the box moves straight.
 
     Raises:
         SettingsError: OMPL is not installed.
@@ -561,8 +596,14 @@ def plan(
             states.append(state)
 
     def joined(first: State, second: State) -> bool:
-        """Return True if the straight motion between two states (d,) is free of collisions. At
-        least one of the states has been reached before."""
+        """Return True if the straight motion between two coordinates is free of collisions.
+
+        It is False if neither coordinate was reached before.
+
+        Args:
+            first: (d,) coordinate in `room`.
+            second: (d,) another coordinate.
+        """
         if first not in places:
             first, second = second, first
         if first not in places:
@@ -588,12 +629,16 @@ def plan(
 def _usable(
     stops: list[ChainConfiguration], place: ChainConfiguration, room: AffineSubspace
 ) -> list[ChainConfiguration]:
-    """Select the configurations that are in a region and at least `SHORT_RETREAT` from an end.
+    """Select the configurations that lie in a region and at least `SHORT_RETREAT` from one end of
+    the carry.
 
     Args:
         stops: the configurations.
-        place: configuration at the end, the start or the goal.
+        place: configuration at the end of the carry: the start or the goal.
         room: the region.
+
+    Returns:
+        The selected configurations.
     """
     at = [room.coordinates(stop.extended) for stop in stops]
     return [
@@ -605,8 +650,12 @@ def _usable(
 
 
 def same(first: ChainConfiguration, second: ChainConfiguration) -> bool:
-    """Return True if the joint positions of both arms agree within `MATCH` in two
-    configurations."""
+    """Return True if the joint positions of both arms agree within `MATCH` in two configurations.
+
+    Args:
+        first: a configuration.
+        second: another configuration.
+    """
     apart = [np.abs(a - b).max() for a, b in zip(first.q, second.q, strict=True)]
     return bool(max(apart) < MATCH)
 
@@ -627,7 +676,7 @@ def connected(
     path is found.
 
     Args:
-        bounds: least and largest value (d,) of each coordinate of a state.
+        bounds: lower and upper bounds (d,) of the states; a state is a point with d coordinates.
         longest: longest motion by which the planner's trees grow, in the unit of the states.
         joined: function that returns True if the straight motion between two states is free.
         ends: states (d,) at which the path may begin, and states at which it may end.
@@ -652,7 +701,7 @@ def connected(
         return tuple(state[k] for k in range(size))
 
     class Validator(base.MotionValidator):  # type: ignore[misc]
-        """OMPL's validator of motions; it asks `joined`."""
+        """OMPL's validator of motions, which calls `joined`."""
 
         def checkMotion(self, first: Any, second: Any) -> bool:
             return joined(values(first), values(second))

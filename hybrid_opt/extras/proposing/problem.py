@@ -88,9 +88,10 @@ class Problem:
 
     @cached_property
     def contacts(self) -> list[dict[str, Any]]:
-        """File entries of both contacts, with their points on the box [m].
+        """File entries (keys and values) of both contacts, with the places of pads or hands on the
+        box.
 
-        Points in the file are kept. Otherwise hands that hold by themselves are placed at the first
+        Places in the file are kept. Otherwise hands that hold by themselves are placed at the first
         of `hand_places`, and pads at the centres of the two opposite faces that face the robots'
         bases or a machine's shoulders. Without bases in the file, these are the faces beside the
         direction of the carry.
@@ -130,8 +131,12 @@ class Problem:
 
     @cached_property
     def _hand_places(self) -> list[list[dict[str, Any]]]:
-        """File entries of both contacts for each considered placement of the arms' hands, the best
-        first."""
+        """File entries of both contacts for each proposed placement of the arms' hands, the best
+        first.
+
+        Raises:
+            WorkcellError: the file is wrong, or no face has room for the hands.
+        """
         size = np.array(self.data["payload"]["size"], dtype=float)
         thickness, problems = float(size.min()), Problems()
         entries = [pattern_entry(entry, thickness) for entry in self.data["contacts"]]
@@ -161,11 +166,14 @@ class Problem:
         return found
 
     def other_contacts(self) -> list[list[dict[str, Any]]]:
-        """Return file entries of both contacts for other placements of the pads or hands, the most
-        promising first. Empty if the file states the points or has no bases.
+        """Return other placements of the pads or hands on the box, the most promising first.
 
         For pads these are all pairs of opposite faces: upright faces first, then those that face
         the robots.
+
+        Returns:
+            File entries of both contacts, for each placement; empty if the file states the places
+            or has no bases.
         """
         if self._bases is None or all("xyz" in entry for entry in self.data["contacts"]):
             return []
@@ -183,7 +191,11 @@ class Problem:
         return [pair for pair in pairs if pair != self.contacts]
 
     def _robots(self) -> tuple[Robot, Robot]:
-        """Read both robots without the rest of the file."""
+        """Read both robots of the file; other tables are not read.
+
+        Raises:
+            WorkcellError: an entry of a robot is wrong.
+        """
         problems = Problems()
         entries = TableReader(self.data, "", problems).tables("robots", exactly=2)
         found = [read_robot(entry, self.source.parent)[0] for entry in entries]
@@ -192,8 +204,8 @@ class Problem:
         return found[0], found[1]
 
     def sides(self) -> list[Problem]:
-        """Return copies of the problem in which the file entries of the contacts place pads or
-        hands on different sides of the box.
+        """Return copies of the problem whose pads or hands are placed on different sides of the
+        box.
 
         Pads take each pair of opposite upright faces; on a machine each pair twice, with exchanged
         arms. Hands take the best of `hand_places`. If the file states the points, or if a level
@@ -270,6 +282,9 @@ class Problem:
 def read_problem(path: str | Path) -> Problem:
     """Read a problem file.
 
+    Args:
+        path: path of the file.
+
     Raises:
         WorkcellError: the file is not TOML, or required keys are missing.
     """
@@ -291,8 +306,14 @@ def read_problem(path: str | Path) -> Problem:
 
 
 def _require_known(table: TableReader) -> None:
-    """Report keys that a proposal needs and that are missing or wrong. All other keys are checked
-    when the workcell is read."""
+    """Report keys that a proposal needs and that are missing or wrong, into the table's list of
+    problems.
+
+    All other keys are checked when the workcell is read.
+
+    Args:
+        table: reader of the whole problem file.
+    """
     task, payload = table.table("task"), table.table("payload")
     _, contacts = (table.tables(key, exactly=2) for key in ("robots", "contacts"))
     if table.problems.found:

@@ -150,7 +150,8 @@ class Proposal:
     Attributes:
         problem: the problem.
         found: the proposed values of the workcell.
-        judgement: the evaluator's verdict on the carry, which is certified between its samples.
+        judgement: verdict of the evaluator, the program's check of a carry. The carry is feasible
+            between its samples too.
         feasible_share: share of feasible candidates among random ones within the bounds.
         candidates: number of candidates with which this share was measured.
         seconds: time of the proposal [s].
@@ -222,8 +223,10 @@ def propose(
     tell: Callable[[str], None] = lambda text: None,
     progress: ShowProgress = False,
 ) -> Proposal:
-    """Propose a complete workcell for a problem file. Of several classes, the one with the shortest
-    joint paths is returned.
+    """Propose a complete workcell, with a first carry, for a problem file.
+
+    Where the settings ask for several classes of carries, the carry with the shortest joint paths
+    is returned.
 
     Args:
         path: a problem file (docs/tutorials/two-robots.md).
@@ -250,8 +253,8 @@ def propose_classes(
     tell: Callable[[str], None] = lambda text: None,
     progress: ShowProgress = False,
 ) -> list[Proposal]:
-    """Propose complete workcells for a problem file, with carries that pass obstacles on different
-    sides or hold the box in other postures. The one with the shortest joint paths comes first.
+    """Propose complete workcells for a problem file, whose carries pass obstacles on different
+    sides or start in other postures.
 
     Args:
         path: a problem file (docs/tutorials/two-robots.md).
@@ -262,6 +265,9 @@ def propose_classes(
         tell: function that is called with a text on the current step.
         progress: True for a progress bar, or a function that is called with the seconds worked and
             the seconds allowed. Most proposals need only a part of the allowed time.
+
+    Returns:
+        The proposals; the one with the shortest joint paths comes first.
 
     Raises:
         WorkcellError: the file is wrong.
@@ -276,7 +282,9 @@ def propose_classes(
 
 @dataclass
 class _Lazy:
-    """A choice of bases for a search, prepared when it is first used."""
+    """A choice of robot bases, `given` as keys of the problem file, that is prepared at its first
+    use.
+    """
 
     given: dict[str, Any]
     spins: Array
@@ -286,7 +294,9 @@ class _Lazy:
 
 @dataclass
 class _Search:
-    """One search for proposals in progress."""
+    """The state of one search for proposals: its settings, the refused paths, and the classes
+    found.
+    """
 
     problem: Problem
     rng: np.random.Generator
@@ -315,7 +325,6 @@ class _Search:
         return self.spent > PLANNING * self.settings.seconds
 
     def _say(self, text: str) -> None:
-        """Report the current step and the elapsed share of the time."""
         self.tell(text)
         limit = ceil(self.settings.seconds)
         self.count(min(int(self.spent), limit), limit)
@@ -345,15 +354,17 @@ class _Search:
         return found
 
     def _takes_all(self, effort: int) -> bool:
-        """Return True if a round in which a planner may check `effort` configurations tries every
-        choice. Every choice of bases is tried; other faces of the box only in late rounds, as long
-        as the faces toward the robots can be held."""
         return self.settings.bases or effort >= OTHER_FACES
 
     def _round(self, lazy: _Lazy, effort: int, most: int, strays: int) -> Iterator[Proposal]:
-        """Yield the carries found in one round with one choice of bases. `effort` is the largest
-        number of configurations that a planner may check, `most` the number of pairs of holds, and
-        `strays` the number of `STRAYS`."""
+        """Yield the carries found in one round of the search with one choice of bases.
+
+        Args:
+            lazy: the choice of bases.
+            effort: largest number of configurations that a planner may check; 0 for straight paths.
+            most: largest number of tried pairs of holds, the postures of both arms at both ends.
+            strays: number of tried entries of `STRAYS`, allowed deviations from a straight path.
+        """
         if lazy.setup is None and not lazy.problem:
             self._say("ways to hold the box")
             try:
@@ -388,8 +399,9 @@ class _Search:
                     yield from self._judged(lazy.setup, pair, via, box)
 
     def _is_known(self, pair: Pair, box: PayloadSceneChecker, path: Array) -> bool:
-        """Return True if a carry was found before with the same holds that passes the obstacles on
-        the same sides as a path of box poses (n, 6) [m, rad]."""
+        """Return True if a carry was found before that has the holds `pair` of both arms and passes
+        the obstacles on the same sides as the box poses `path` (n, 6) [m, rad].
+        """
         return bool(self.known) and (id(pair), box.sides_passed(path)) in self.known
 
     @property
@@ -415,9 +427,6 @@ class _Search:
         return ProposalError(text, code="out-of-time" if self.too_late else "no-path")
 
     def _remedies(self, spins: Array) -> str:
-        """Return a text on the smallest changes of the cell with which both arms can hold the box;
-        '' if none are found in time. `spins` (n,) are the rotations of the pads that are tried
-        [rad]."""
         if self.settings.bases or not self.settings.remedies:
             return ""
         self._say("the least change with which the box can be held")
@@ -427,8 +436,10 @@ class _Search:
     def _paths(
         self, setup: Setup, pair: Pair, effort: int, strays: int, box: PayloadSceneChecker
     ) -> Iterator[list[ChainConfiguration] | None]:
-        """Yield collision-free paths, each by its corners, with one pair of holds; None for a
-        search without result. `effort` and `strays` are those of the round."""
+        """Yield the corners of collision-free paths with the holds `pair` of both arms, None for a
+        search without result. A planner may check `effort` configurations, 0 for straight paths,
+        and tries the first `strays` of `STRAYS`, allowed deviations from a straight path.
+        """
         if not effort:
             found = straight_paths(pair.chain, pair.retreats, box)
             yield from islice(found, None if self.settings.classes > 1 else 1)
@@ -451,8 +462,12 @@ class _Search:
             )
 
     def _via_points(self, pair: Pair, corners: list[ChainConfiguration]) -> Array | None:
-        """Find the smallest number of via-points (k, 6 + m) whose spline follows a path without
-        collision; None if there are none. A via-point is a box pose and the m redundant joints."""
+        """Find the fewest via-points whose spline follows the path with these corners without
+        collision.
+
+        Returns:
+            (k, 6 + m) box poses [m, rad] and m redundant joints [rad or m]; None if there are none.
+        """
         self._say("via-points")
         dense = remove_corners(pair.chain, corners, self.rng)
         for count in range(1, MOST_VIA_POINTS + 1):
@@ -464,8 +479,10 @@ class _Search:
     def _judged(
         self, setup: Setup, pair: Pair, via: Array, box: PayloadSceneChecker
     ) -> Iterator[Proposal]:
-        """Yield the proposal whose carry passes the via-points (k, 6 + m), unless the evaluator
-        refuses the carry or a carry of its class was found before."""
+        """Yield the proposal whose carry passes the via-points `via` (k, 6 + m), box poses [m, rad]
+        and m redundant joints [rad or m]. Yield nothing if the evaluator refuses the carry, or if a
+        carry of its class was found before.
+        """
         fitted = np.vstack([pair.start.extended, via, pair.goal.extended])
         if self._is_known(pair, box, _poses(fitted)):
             return
@@ -519,8 +536,9 @@ class _Search:
     def _draft(
         self, setup: Setup, pair: Pair, waypoints: Array, bounds: Bounds | None = None
     ) -> Draft:
-        """Build the draft of the carry through waypoints (n, 6 + m), box poses with redundant
-        joints, rounded as in a file."""
+        """Build the draft of the carry through waypoints (n, 6 + m), box poses [m, rad] and m
+        redundant joints [rad or m], rounded as in a file. Pads keep their rotations of `pair`.
+        """
         spins = (pair.holds[0].spin, pair.holds[1].spin)
         rounded = np.round(waypoints, 4)
         return Draft(setup.workcell, spins, (-1, -1), rounded, setup.given, bounds)
@@ -528,8 +546,9 @@ class _Search:
     def _trial(
         self, setup: Setup, pair: Pair, waypoints: Array, bodies: CellBodies | None = None
     ) -> Trial:
-        """Build the evaluator of the carry through waypoints (n, 6 + m), box poses with redundant
-        joints."""
+        """Build the evaluator of the carry through waypoints (n, 6 + m), box poses [m, rad] and m
+        redundant joints [rad or m]. The cell's `bodies` are built anew if None.
+        """
         workcell = self._workcell(self._draft(setup, pair, waypoints))
         bodies = bodies or build_cell_bodies(workcell, setup.bodies)
         return Trial(workcell, pair.start.q, bodies, named=False)

@@ -17,7 +17,12 @@ from symbolic.errors import DualArmError
 
 
 def fastest_carry(cell: Cell, evaluations: int, rng: np.random.Generator) -> Carry:
-    """Find the fastest carry of a small study of a drivable cell: one search, one polish.
+    """Find the fastest carry of a drivable cell by a small study: one search and one polish.
+
+    Args:
+        cell: the cell.
+        evaluations: number of candidates of the search.
+        rng: generator of all random numbers.
 
     Raises:
         SettingsError: no feasible carry was found.
@@ -32,14 +37,17 @@ def rank_homotopy_classes(
     rng: np.random.Generator,
     tell: Callable[[str], None] = lambda text: None,
 ) -> tuple[list[Proposal], Table]:
-    """Sort proposals by the duration of the fastest carry that a search within each one's bounds
-    finds. Return them with a table of these durations.
+    """Sort proposals by the duration of the fastest carry that a small study within each proposal's
+    bounds finds.
 
     Args:
         proposals: proposals of different classes.
         evaluations: number of candidates of each search.
         rng: generator of all random numbers.
         tell: function that is called with a text on the current step.
+
+    Returns:
+        The proposals, fastest first, and a table of the durations.
     """
     rows = []
     for k, proposal in enumerate(proposals, 1):

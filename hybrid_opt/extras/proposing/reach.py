@@ -100,22 +100,34 @@ class _Lines:
         return np.tile(self._pose, (len(q), 1)), first, second
 
     def touched(self, q: Array) -> str:
-        """Return a text on the collision at joint positions q (joints,) of both arms side by side;
-        '' for none."""
+        """Return a text on the collision at one position of both arms; '' for none.
+
+        Args:
+            q: (joints,) joint positions of both arms, side by side [rad or m].
+        """
         touch = self._checker.check(*self._placed(q[None])).first_touch
         return "" if touch is None else str(touch)
 
     def free(self, first: Array, second: Array) -> bool:
-        """Return True if no sampled configuration on the line between two joint positions (joints,)
-        collides."""
+        """Return True if no sampled position on a straight line in joint space collides. The first
+        end is not checked.
+
+        Args:
+            first: (joints,) joint positions of both arms at the beginning of the line [rad or m].
+            second: (joints,) joint positions at its end [rad or m].
+        """
         n = int(np.ceil(np.abs(second - first).max() / JOINT_STEP)) + 1
         q = np.linspace(first, second, n + 1)[1:]
         self.looked += len(q)
         return self._checker.check(*self._placed(q)).is_free
 
     def proven(self, first: Array, second: Array) -> bool:
-        """Return True if the whole line between two joint positions (joints,) is proven free of
-        collisions."""
+        """Return True if a whole straight line in joint space is proven free of collisions.
+
+        Args:
+            first: (joints,) joint positions of both arms at the beginning of the line [rad or m].
+            second: (joints,) joint positions at its end [rad or m].
+        """
 
         def at(u: Array) -> tuple[Array, Array, Array]:
             return self._placed(first + u[:, None] * (second - first))
@@ -164,7 +176,10 @@ def _shortened(lines: _Lines, corners: list[Array]) -> list[Array]:
 
     Args:
         lines: collision checker of straight motions.
-        corners: joint positions (joints,) of both arms [rad or m].
+        corners: joint positions (joints,) of both arms at each corner [rad or m].
+
+    Returns:
+        The remaining corners, both ends included.
     """
     found, at = [corners[0]], 0
     while at < len(corners) - 1:

@@ -42,15 +42,26 @@ class ProblemChange:
     change: Callable[[Problem, Tables, float], None]
 
     def applied(self, problem: Problem, amount: float) -> Problem:
-        """Return the problem changed by an amount [m]."""
+        """Return a copy of a problem to which this change is applied.
+
+        Args:
+            problem: the problem.
+            amount: amount of the change [m].
+        """
         data = copy.deepcopy(problem.data)
         self.change(problem, data, amount)
         return replace(problem, data=data)
 
 
 def _towards(problem: Problem) -> Array:
-    """Compute horizontal unit vectors (2, 3) in the world from each base to the middle of the
-    carry. Both are equal for a machine with two arms."""
+    """Compute horizontal unit vectors (2, 3) in the world from each robot's base to the middle of
+    the carry.
+
+    Both vectors are equal for a machine with two arms.
+
+    Args:
+        problem: problem whose file states the bases.
+    """
     middle = np.mean(problem.poses, axis=0)[:3]
     bases = np.array([robot["base"]["xyz"] for robot in problem.data["robots"]], dtype=float)
     away = (middle - bases) * [1.0, 1.0, 0.0]
@@ -72,8 +83,14 @@ def _raise_bases(problem: Problem, data: Tables, amount: float) -> None:
 
 
 def _lengthen_tools(problem: Problem, data: Tables, amount: float) -> None:
-    """Move both pads along their normals in the tables `data`, by an amount [m]. The bodies of the
-    tools stay in place."""
+    """Move both pads outwards along their normals, in a copy of the problem's tables. The bodies of
+    the tools stay in place.
+
+    Args:
+        problem: the problem; not used.
+        data: tables of the problem file, which are changed.
+        amount: displacement of the pads [m].
+    """
     for robot in data["robots"]:
         pad = robot["pad"]
         normal = rotation_from_rpy(pad.get("rpy", [0.0, 0.0, 0.0]))[:, 2]
@@ -132,11 +149,14 @@ def _can_hold(problem: Problem, spins: Array, rng: np.random.Generator) -> bool:
 def remedies_text(
     problem: Problem, spins: Array, rng: np.random.Generator, is_over: Callable[[], bool]
 ) -> str:
-    """Return a text on the smallest changes with which both arms can hold the box; '' if the file
-    states no bases or no change was found.
+    """Return a text on the smallest changes with which both arms can hold the box.
+
+    The text is '' if the file states no bases or no change was found.
 
     Args:
+        problem: the problem.
         spins: (n,) rotations of the pads about their normals that are tried [rad].
+        rng: generator of random postures.
         is_over: function that returns True if the search has to end.
     """
     robots = problem.data["robots"]

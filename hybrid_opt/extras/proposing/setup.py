@@ -54,7 +54,8 @@ MOST_POSITIONS = 6
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """A hold of each arm, with which the arms do not collide at start and goal.
+    """A hold of each arm, with which the arms do not collide at start and goal. A hold is a
+    rotation of the arm's pad, and a posture at start and goal.
 
     Attributes:
         holds: the holds of both arms.
@@ -72,7 +73,9 @@ class Pair:
 
     @cached_property
     def retreats(self) -> Retreats:
-        """Configurations that straight collision-free motions out of start and goal reach."""
+        """Configurations that straight collision-free motions out of start and goal reach, as
+        `planner.retreats` returns them.
+        """
         return retreats(self.chain, (self.start, self.goal))
 
 
@@ -124,7 +127,12 @@ def _place(task: Task, pose: Array, holds: tuple[Hold, Hold], end: int) -> Chain
 
 
 def _free(judge: PoseJudge, *places: ChainConfiguration) -> bool:
-    """Return True if none of the configurations `places` collides."""
+    """Return True if no configuration collides.
+
+    Args:
+        judge: checker of collisions.
+        *places: the configurations.
+    """
     return not any(
         judge.colliding(place.extended[None, :POSE_SIZE], place.q[0][None], place.q[1][None])[0]
         for place in places
@@ -233,11 +241,15 @@ def prepare(
 
 
 def _progress(searches: Sequence[HoldSearch]) -> tuple[float, ...]:
-    """Return a key by which results of the search for holds are compared: larger if the less
+    """Return a key that compares results of the search for holds. A key is larger if the less
     successful arm got farther.
 
     Args:
         searches: result for each arm.
+
+    Returns:
+        Of the less successful arm: number of holds, share of a box path that was followed, number
+        of collision-free postures, number of postures.
     """
     return min((len(one.holds), one.kept, one.free, one.within) for one in searches)
 
@@ -306,9 +318,11 @@ def redundant_joints(workcell: Workcell, arm: int, common: tuple[str, ...]) -> t
 
 
 def box_blocked(judge: PoseJudge, start: Array, goal: Array) -> str:
-    """Return a text on the bodies that the box meets at start or goal, arms left out; '' for none.
+    """Return a text on the bodies that the box meets at start or goal; '' for none. Arms are left
+    out.
 
     Args:
+        judge: checker of collisions.
         start: (6,) pose of the box at the start [m, rad].
         goal: (6,) pose of the box at the goal [m, rad].
     """

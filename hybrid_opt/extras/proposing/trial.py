@@ -53,7 +53,11 @@ class PayloadSceneChecker:
     """Collision checker of the box and the environment, without the arms."""
 
     def __init__(self, workcell: Workcell) -> None:
-        """Prepare the shapes of box and environment."""
+        """Prepare the shapes of box and environment.
+
+        Args:
+            workcell: the cell.
+        """
         meshes = MeshReader()
         self._orientation = workcell.task.orientation
         self._met: dict[tuple[bytes, bytes], bool] = {}
@@ -79,7 +83,7 @@ class PayloadSceneChecker:
 
         Args:
             begin, end: (6,) box poses at the ends [m, rad].
-            shares: (n,) places on the motion that are checked, in [0, 1].
+            shares: (n,) places on the motion that are checked: 0 is its beginning, 1 its end.
         """
         key = begin.tobytes(), end.tobytes()
         if key not in self._met:
@@ -87,7 +91,7 @@ class PayloadSceneChecker:
         return self._met[key]
 
     def sides_passed(self, path: Array) -> tuple[str, ...]:
-        """Return on which sides a path of the box passes the obstacles of the straight motion
+        """Name the side on which a path of the box passes each obstacle of the straight motion
         between its ends. Bodies that the box touches at an end, such as its support, do not count.
 
         Args:
@@ -147,8 +151,12 @@ def _passage(
     abreast = min(boxes, key=lambda box: abs(_reach(box, along) - _reach(box, -along) - middle))
 
     def faces(other: tuple[Piece, ...], side: Array) -> bool:
-        """Return True if the box would meet the body `other` if it moved in the direction `side`
-        (3,)."""
+        """Return True if the box would meet a body if it moved in a given direction.
+
+        Args:
+            other: solids of the body.
+            side: (3,) direction in the world.
+        """
         across = along, np.cross(along, side)
         return any(
             _gap(abreast, (piece,), side) >= 0.0
@@ -171,13 +179,24 @@ def _passage(
 
 
 def _gap(box: tuple[Piece, ...], body: tuple[Piece, ...], direction: Array) -> float:
-    """Compute how far a box may move along a direction (3,) until it would meet the extent of a
-    body in this direction [m]; negative if the extents overlap."""
+    """Compute how far the box may move along a direction until its extent in this direction reaches
+    that of a body [m]; negative if the extents overlap.
+
+    Args:
+        box: solids of the box.
+        body: solids of the body.
+        direction: (3,) unit direction in the world.
+    """
     return -_reach(body, -direction) - _reach(box, direction)
 
 
 def _reach(pieces: tuple[Piece, ...], direction: Array) -> float:
-    """Compute the largest coordinate of solids along a direction (3,) in the world [m]."""
+    """Compute the largest coordinate of solids along a direction [m].
+
+    Args:
+        pieces: the solids.
+        direction: (3,) unit direction in the world.
+    """
     return max(float(support(piece, direction)[0]) for piece in pieces)
 
 
@@ -193,7 +212,13 @@ class PoseJudge:
     """
 
     def __init__(self, geometry: CellGeometry, checker: CollisionChecker, margin: float) -> None:
-        """Store the attributes. Use `judge_of` to build a checker for a cell."""
+        """Store the attributes. `judge_of` builds a checker from a cell.
+
+        Args:
+            geometry: the cell's bodies and the pairs of them that are checked.
+            checker: collision checker whose clearance includes the margin.
+            margin: additional clearance [m].
+        """
         self.geometry = geometry
         self.margin = margin
         self.met: Counter[tuple[str, str]] = Counter()
@@ -254,7 +279,10 @@ class PoseJudge:
         return self.checker.check(pose, q_1, q_2, bounds).colliding
 
     def resting(self, pose: Array) -> list[tuple[str, bool]]:
-        """Find the bodies of the environment that the box touches at a pose (6,) [m, rad].
+        """Find the bodies of the environment that the box touches at a pose.
+
+        Args:
+            pose: (6,) pose of the box [m, rad].
 
         Returns:
             Names of the bodies, each with True if the box penetrates it deeper than a resting box
@@ -296,7 +324,11 @@ class PoseJudge:
 
 
 def judge_of(bodies: CellBodies) -> PoseJudge:
-    """Build the collision checker of a cell, without a margin."""
+    """Build the collision checker of a cell, without additional clearance.
+
+    Args:
+        bodies: arms and bodies of the cell.
+    """
     made = bodies.screening
     functions = {name: interpret(made[name]) for name in made if not name.endswith("motion")}
     return PoseJudge(bodies.geometry, CollisionChecker(bodies.geometry, functions), 0.0)
@@ -342,7 +374,8 @@ class Trial:
         Args:
             workcell: the proposed cell.
             start: postures (joints,) of both arms at the beginning of the carry [rad or m].
-            bodies: bodies of the same cell with another carry; computed if None.
+            bodies: arms and bodies of the cell, if known from a trial of another carry; None to
+                compute them.
             named: True to find the indices of the branches; False to leave them at -1 and use the
                 postures themselves.
 
@@ -375,8 +408,11 @@ class Trial:
         return initial_decision(self.workcell.task)
 
     def start_of(self, x: Array) -> tuple[Array, Array]:
-        """Compute the posture (joints,) of each arm at the start of the carry of a decision vector
-        x (n_var,) [rad or m]."""
+        """Compute the posture (joints,) [rad or m] of each arm at the start of a candidate's carry.
+
+        Args:
+            x: (n_var,) decision vector.
+        """
         outputs = self.evaluator.outputs(x[None])
         return outputs["q_1"][0, 0], outputs["q_2"][0, 0]
 
@@ -395,12 +431,19 @@ class Trial:
         )
 
     def certain(self, x: Array) -> bool:
-        """Return True if the carry of a decision vector x (n_var,) is feasible at its samples and
-        between them."""
+        """Return True if the carry of a decision vector is feasible at its samples and between
+        them.
+
+        Args:
+            x: (n_var,) decision vector.
+        """
         return bool(self.feasible(x[None])[0]) and self.verdict_on(x)[0].feasible
 
     def verdict_on(self, x: Array) -> tuple[Judgement, str]:
-        """Evaluate the carry of a decision vector x (n_var,) at its samples and between them.
+        """Evaluate the carry of a decision vector at its samples and between them.
+
+        Args:
+            x: (n_var,) decision vector.
 
         Returns:
             The verdict; and the reason if the carry is not feasible, else ''.
@@ -419,7 +462,10 @@ class Trial:
         return replace(judgement, feasible=False, reason="between_samples"), place
 
     def feasible(self, x: Array) -> NDArray[np.bool_]:
-        """Find decision vectors x (n, n_var) whose carries are feasible at all samples of the task.
+        """Find decision vectors whose carries are feasible at all samples of the task.
+
+        Args:
+            x: (n, n_var) decision vectors.
 
         Returns:
             (n,) True for feasible ones.
@@ -449,8 +495,8 @@ class Trial:
         )
 
     def _hit(self, placed: list[Array], rows: NDArray[np.intp]) -> bool:
-        """Return True if a carry collides at one of the given samples. Those with the smallest
-        bounds of clearance are checked first.
+        """Return True if a carry collides at one of the given samples. Samples whose lower bound of
+        the clearance is smallest are checked first.
 
         Args:
             placed: box poses (n, 6) and joint positions (n, joints) of both arms, at n samples.
@@ -484,7 +530,15 @@ class BranchLostError(Exception):
 
 
 def _branch(branches: tuple[StartBranch, ...], q: Array) -> int:
-    """Return the index of the start branch that equals a posture q (joints,) up to full turns."""
+    """Return the index of the start branch whose posture equals a given one up to full turns.
+
+    Args:
+        branches: start branches of the arm.
+        q: (joints,) the posture [rad].
+
+    Raises:
+        BranchLostError: no start branch has this posture.
+    """
     apart = [
         float(np.abs(np.remainder(branch.q - q + np.pi, 2.0 * np.pi) - np.pi).max())
         for branch in branches
@@ -496,9 +550,15 @@ def _branch(branches: tuple[StartBranch, ...], q: Array) -> int:
 
 
 def grasp_blocked(trial: Trial, handling: Handling) -> str:
-    """Return a text on what blocks the pads before or after a trial's carry: at their approach, the
-    lift, the set-down or their retreat. It is '' if nothing does, or if no jobs are planned for
-    such pads."""
+    """Return a text on what blocks the pads before or after a carry: at their approach, the lift,
+    the set-down or their retreat.
+
+    The text is '' if nothing blocks them, or if no jobs are planned for such pads.
+
+    Args:
+        trial: the carry, with its evaluator.
+        handling: motions of the pads before and after the carry.
+    """
     cell = replace(trial.workcell, handling=handling)
     if not cell.has_facing_pads:
         return ""

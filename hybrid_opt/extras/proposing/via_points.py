@@ -54,19 +54,30 @@ BLOCKED = 100.0
 
 
 def path_length(points: Array) -> float:
-    """Compute the Euclidean length of a path through points (n, m)."""
+    """Compute the Euclidean length of the straight lines between successive points.
+
+    Args:
+        points: (n, m) points; the length has their unit.
+    """
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
 def joint_length(places: Sequence[ChainConfiguration]) -> float:
-    """Compute the Euclidean length of the path in the joint space of both arms through
-    configurations [rad]."""
+    """Compute the Euclidean length of a path in the joint space of both arms [rad].
+
+    Args:
+        places: configurations along the path.
+    """
     return path_length(np.array([np.concatenate(place.q) for place in places]))
 
 
 def along(corners: Sequence[ChainConfiguration]) -> Array:
-    """Compute box poses (n, 6) [m, rad] on the straight motions between successive corners of a
-    path."""
+    """Compute box poses (n, 6) [m, rad] on a path of straight motions, neighbours at most
+    `planner.PATH_STEP` apart.
+
+    Args:
+        corners: configurations at the corners of the path.
+    """
     legs = [straight(a.extended, b.extended)[:, :POSE_SIZE] for a, b in pairwise(corners)]
     return np.vstack(legs)
 
@@ -79,7 +90,7 @@ def remove_corners(
     Args:
         chain: both arms with a fixed hold each.
         corners: corners of a collision-free path.
-        rng: generator of the places.
+        rng: generator that chooses the places.
 
     Returns:
         Configurations along the path, at most `planner.PATH_STEP` apart.
