@@ -123,14 +123,15 @@ class Lines:
     meaning: str
 
     def require(self, workcell: Workcell, target: str) -> None:
-        """Check that the names of outputs and inputs in the drivers of a cell are valid for a
-        target. A driver need not name an input.
+        """Check that a target allows the names of outputs and inputs in the drivers of a cell. A
+        driver need not name an input.
 
         Args:
+            workcell: the cell.
             target: name of the target, for the message.
 
         Raises:
-            SettingsError: a name is not valid; the message states the key and the allowed names.
+            SettingsError: a name is not allowed; the message states the key and the allowed names.
         """
         for robot in workcell.robots:
             driver = robot.driver
@@ -187,6 +188,10 @@ SERVICES = Lines(
 def addressed(workcell: Workcell, addresses: tuple[str, str]) -> Workcell:
     """Return the cell with other host names or IP addresses of its two controllers.
 
+    Args:
+        workcell: the cell.
+        addresses: host name or IP address of each robot's controller.
+
     Raises:
         SettingsError: an address is neither a host name nor an IP address.
     """
@@ -199,8 +204,10 @@ def addressed(workcell: Workcell, addresses: tuple[str, str]) -> Workcell:
 
 
 def described(robot: Robot) -> str:
-    """Return the words that may name the maker of a robot: file, name, links and xacro arguments,
-    in lower case."""
+    """Return the words that may name the maker of a robot, in one lower-case text.
+
+    The words are its file, its name, its links and the values of its xacro arguments.
+    """
     urdf = robot_urdf(robot)
     words = [robot.urdf.name, urdf.name, *urdf.links]
     words += [value for _, value in robot.xacro_arguments]
@@ -221,12 +228,15 @@ def comment(text: str) -> str:
 
 
 def prefixes(workcell: Workcell) -> tuple[str, str]:
-    """Return for each robot the prefix of its links' and joints' names in ROS; '' for both arms of
-    one machine.
+    """Return, for each robot, the prefix of its links' and joints' names in ROS.
+
+    Both are '' if the robots are arms of one machine.
+
+    Args:
+        workcell: the cell.
 
     Raises:
-        SettingsError: the prefixes that the drivers state would give joints of both arms the same
-            names.
+        SettingsError: the prefixes in the file would give joints of both arms the same names.
     """
     if one_machine(workcell.robots):
         return "", ""
@@ -246,8 +256,15 @@ def prefixes(workcell: Workcell) -> tuple[str, str]:
 
 
 def ros_joints(workcell: Workcell) -> dict[str, int]:
-    """Return each joint's column in arrays (n, joints) of both arms side by side, by the joint's
-    name in ROS. A joint that moves both arms of a machine has its column in the first arm.
+    """Return the column of each joint in arrays (n, joints) of both arms side by side.
+
+    A joint that moves both arms of a machine has its column in the first arm.
+
+    Args:
+        workcell: the cell.
+
+    Returns:
+        Index of the column by the joint's name in ROS.
 
     Raises:
         SettingsError: joints of both arms would have the same names.
@@ -271,6 +288,7 @@ def description(workcell: Workcell, q: Array) -> str:
     """Return the URDF of the cell with both arms, as text.
 
     Args:
+        workcell: the cell.
         q: (joints,) initial joint positions in a simulator, both arms side by side [rad, or m for
             sliding joints].
     """
@@ -325,8 +343,12 @@ def _add_robot(root: ElementTree.Element, robot: Robot, prefix: str, moving: set
 
 
 def _hold(joint: ElementTree.Element, position: float) -> None:
-    """Change a URDF joint, in place, to a fixed joint at a position [rad, or m for a sliding
-    joint]."""
+    """Change a URDF joint, in place, to a fixed joint at one of its positions.
+
+    Args:
+        joint: element of the joint.
+        position: position of the joint [rad, or m for a sliding joint].
+    """
     origin, axis = joint.find("origin"), joint.find("axis")
     xyz, rpy = (
         _numbers("0 0 0" if origin is None else origin.get(key, "0 0 0")) for key in ("xyz", "rpy")
@@ -365,6 +387,8 @@ def _shapes(link: ElementTree.Element, shape: Shape | Capsule | UrdfMesh, pose: 
     become a cylinder and two spheres.
 
     Args:
+        link: element of the link.
+        shape: the shape.
         pose: (4, 4) pose of the shape on the link.
     """
     if isinstance(shape, Capsule):

@@ -215,7 +215,12 @@ def manifest(
 
 
 def readme(document: Mapping[str, Any], contents: Contents) -> str:
-    """Return the README of a bundle: its content, how to run it, and what stops the robots."""
+    """Return the README of a bundle: its content, how to run it, and what stops the robots.
+
+    Args:
+        document: manifest of the bundle.
+        contents: contents of the bundle's files by path.
+    """
     squeeze, machine = document["squeeze"], document["machine"]
     phases = [
         f"| {phase['name'].replace('_', ' ')} | {phase['begin']:.2f} | {phase['duration']:.2f} | "
@@ -261,7 +266,12 @@ def readme(document: Mapping[str, Any], contents: Contents) -> str:
 
 
 def warnings_of(job: Job) -> list[str]:
-    """Return warnings that an engineer should read before this job runs."""
+    """Return sentences with warnings that an engineer should read before a job runs; empty for
+    none.
+
+    Args:
+        job: the job.
+    """
     cell, found = job.workcell, []
     peak, rated = job.peak_normal_force, cell.task.reference_force
     for robot, force, most in zip(cell.robots, peak, rated, strict=True):
@@ -384,8 +394,10 @@ def export(
 
 
 def prepared(job: Job, name: str, options: BundleOptions) -> Export:
-    """Sample a job at the requested time step, or else at the longest one for which the error of
-    the pads' forces between samples stays within the share `TRACKED`.
+    """Sample a job at a time step.
+
+    The step is the requested one, or else the longest one with a small enough error of the pads'
+    forces between samples: at most the share `TRACKED`.
 
     Args:
         job: the job.
@@ -395,7 +407,7 @@ def prepared(job: Job, name: str, options: BundleOptions) -> Export:
     Raises:
         SettingsError: the step is out of range, no step keeps the force error small enough, or the
             target needs a stiffness that is unknown.
-        JobError: the commanded forces hold the box in no stop along the path.
+        JobError: at no place of the path do the commanded forces hold the box in a stop.
     """
     target, step, k = target_for(name, job.workcell), options.step, options.stiffness
     k = target.stiffness_of(job, name) if k is None else k

@@ -167,8 +167,11 @@ class Finding:
 
 
 def read_trajectory(path: Path, workcell: Workcell) -> JointTrajectory:
-    """Read the joint positions of a cell's arms from a file: CSV, JSON (job.json, or a message of
-    ROS 2), or YAML of ROS 2.
+    """Read the joint positions of a cell's arms from a file.
+
+    Args:
+        path: path of the file: CSV, JSON (job.json, or a message of ROS 2), or YAML of ROS 2.
+        workcell: the cell.
 
     Raises:
         ResultsError: the file cannot be read, or lacks joints of the cell.
@@ -203,9 +206,12 @@ of the joint."""
 def _csv_columns(text: str) -> tuple[Columns, tuple[float, float] | None]:
     """Read the columns of a CSV file with joint positions.
 
+    Args:
+        text: text of the file.
+
     Returns:
-        The columns; and the first and last time at which the column `phase` is 'carry' [s], None
-        without any.
+        Times (n,) [s] with the columns (n,) by quantity and joint name; and the first and last time
+        at which the column `phase` is 'carry' [s], None if there is none.
     """
     rows = list(csv.reader(io.StringIO(text)))
     header, body = rows[0], [row for row in rows[1:] if row]
@@ -254,8 +260,13 @@ def _document_columns(document: Any) -> Columns:
 
 
 def _chosen(columns: Columns, workcell: Workcell) -> JointTrajectory:
-    """Select the joints of a cell from the columns of a file. A joint may be named ROBOT/JOINT, by
-    its name in ROS, or plainly if the plain name is unique.
+    """Select the joints of a cell from the columns of a file.
+
+    A joint may be named ROBOT/JOINT, by its name in ROS, or plainly if the plain name is unique.
+
+    Args:
+        columns: times (n,) [s], and columns (n,) by quantity and joint name.
+        workcell: the cell.
 
     Raises:
         ValueError: a joint is missing, or times or values are not valid.
@@ -363,16 +374,29 @@ def check(
 
 
 def _places(time: Array) -> Array:
-    """Return ascending times (k,) [s]: those of n samples (n,), and some between two neighbours, at
-    the shares `BETWEEN` of the step."""
+    """Return the times of n samples, with further times between neighbours at the shares `BETWEEN`
+    of each step.
+
+    Args:
+        time: (n,) ascending times of the samples [s].
+
+    Returns:
+        (k,) ascending times [s].
+    """
     steps = np.diff(time)
     inside = [time[:-1] + share * steps for share in (0.0, *BETWEEN)]
     return np.append(np.column_stack(inside).ravel(), time[-1])
 
 
 def _load(cell: Cell) -> NumericFunction:
-    """Return the compiled function of the contact forces. It is loaded alone, because a timing
-    model would also load its compiled passes."""
+    """Return the compiled function that computes the contact forces from pose, velocity and
+    acceleration of the box.
+
+    The function is loaded alone, because a timing model would also load its compiled passes.
+
+    Args:
+        cell: the cell.
+    """
 
     def make(model: CellModel) -> Mapping[str, ca.Function]:
         from symbolic.contact.load import load_function
@@ -386,7 +410,8 @@ def _certificate(cell: Cell, joints: BPoly, time: Array) -> str:
     """Prove that the motion of both arms and box is free of collisions.
 
     Args:
-        joints: joint positions of both arms over time.
+        cell: the cell.
+        joints: polynomials of both arms' joint positions over time.
         time: (n,) times of the samples, first to last of the proof [s].
 
     Returns:
@@ -430,10 +455,11 @@ def _held(along: Array, across: Array) -> Mask:
 
 
 def _poses(workcell: Workcell, q: Array) -> Array:
-    """Compute the box poses (n, 6) [m, rad] that follow from the first arm's pad, in the convention
-    of the cell's task.
+    """Compute the box poses (n, 6) [m, rad] that follow from the place of the first arm's pad, in
+    the convention of the cell's task.
 
     Args:
+        workcell: the cell.
         q: (n, joints) joint positions of both arms side by side [rad or m].
     """
     T_pad_box = inverse(workcell.contacts[0].T_box_pad)
@@ -452,7 +478,11 @@ def _most(values: Array, limit: float) -> float:
 
 
 def as_document(finding: Finding) -> Mapping[str, Any]:
-    """Convert the result of a check to JSON values."""
+    """Convert the result of a check to JSON values.
+
+    Args:
+        finding: the result.
+    """
     return {
         "duration": finding.duration,
         "interpolation": finding.interpolation,

@@ -27,8 +27,15 @@ SCHEMA = "job.schema.json"
 
 
 def data_files(export: Export) -> dict[str, str | bytes]:
-    """Return the contents of a job's data files by path: a table, a JSON file with its schema, and
-    a recording for ROS 2."""
+    """Return the data files of a job: a table, a JSON file with its schema, and a recording for ROS
+    2.
+
+    Args:
+        export: the job at the target's time steps.
+
+    Returns:
+        Contents of the files by path.
+    """
     schema = (files("hybrid_opt.extras.bundles") / SCHEMA).read_text("utf-8")
     tables = {"job.csv": job_table(export), "job.json": job_text(export), SCHEMA: schema}
     return tables | recording(export)
@@ -41,8 +48,12 @@ _JOINT_UNITS = (("rad", "m"), ("rad/s", "m/s"), ("rad/s^2", "m/s^2"), ("N m", "N
 
 
 def job_table(export: Export) -> str:
-    """Return the job as a table with one row per time step, and one column per quantity with its
-    unit."""
+    """Return the job as a CSV table with one row per time step, and one column per quantity with
+    its unit.
+
+    Args:
+        export: the job at the target's time steps.
+    """
     job, sampled = export.job, export.sampled
     robots = [robot.name for robot in job.workcell.robots]
     pose = zip(components(job.workcell.task.orientation), _POSE_UNITS, strict=True)
@@ -80,8 +91,14 @@ RECORDED = (
 
 
 def recording(export: Export) -> dict[str, str | bytes]:
-    """Return the files of a ROS 2 recording of a job by path; its times count from zero. Without
-    the extra `ros` return a note instead."""
+    """Return the files of a ROS 2 recording of a job, whose times count from zero.
+
+    Args:
+        export: the job at the target's time steps.
+
+    Returns:
+        Contents by path; without the extra `ros`, only a note that says what to install.
+    """
     try:
         from mcap.writer import Writer
         from rosbags.typesys import Stores, get_typestore
@@ -108,10 +125,14 @@ def recording(export: Export) -> dict[str, str | bytes]:
 
 
 def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, str, Any]]:
-    """Yield the messages of every sample, each with its time [ns] and topic.
+    """Yield the ROS messages of every sample of a job.
 
     Args:
+        export: the job at the target's time steps.
         types: ROS message classes by name.
+
+    Yields:
+        Time [ns], topic and message.
     """
     sampled, cell, joined = export.sampled, export.workcell, prefixes(export.workcell)
     joints = ros_joints(cell)
@@ -128,15 +149,23 @@ def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, s
         return types[f"{package}/msg/{name}"](*values)
 
     def placed(kind: str, T: Array) -> tuple[Any, Any]:
-        """Convert a pose T (4, 4) to a position, as a ROS message of the type `kind`, and a
-        quaternion message."""
+        """Convert a pose to ROS messages of a position and a quaternion.
+
+        Args:
+            kind: type of the position's message in `geometry_msgs`.
+            T: (4, 4) pose.
+        """
         turn = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
         position = of(f"geometry_msgs/{kind}", *T[:3, 3].tolist())
         return position, of("geometry_msgs/Quaternion", *turn)
 
     def frames(k: int) -> Iterator[tuple[str, Array]]:
-        """Yield name and pose (4, 4) in the world of each frame at sample k: the box, every link of
-        both arms, and both pads."""
+        """Yield the name of each frame and its pose (4, 4) in the world: the box, every link of
+        both arms, and both pads.
+
+        Args:
+            k: index of the sample.
+        """
         yield "box", boxes[k]
         for arm, robot in enumerate(cell.robots):
             model, found, prefix = models[arm], data[arm], joined[arm]

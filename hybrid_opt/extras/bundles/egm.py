@@ -43,7 +43,7 @@ UNKNOWN_TOOL_MASS = 0.1
 
 def require_egm(workcell: Workcell, leader: int) -> None:
     """Check that a cell's force-controlled arm has force control on its controller, and that the
-    delays of both arms are known.
+    cell states the delay of each arm.
 
     Args:
         workcell: the cell.
@@ -74,15 +74,21 @@ def require_egm(workcell: Workcell, leader: int) -> None:
 
 
 def tasks_of(export: Export) -> tuple[str, str]:
-    """Return the name of each arm's RAPID task on the controller."""
+    """Return the name of each arm's RAPID task on the controller, for the first and the second arm.
+
+    Args:
+        export: the job.
+    """
     two_armed = all(len(joints) == SEVEN for joints in export.job.joint_names)
     return TWO_ARMED_TASKS if two_armed else TASKS
 
 
 def _checked_start(joints: int) -> Iterator[str]:
     """Yield the lines of a RAPID procedure that ends the program if the arm is not at the first
-    position of the job. The procedure does not move there, because such a move would not be checked
-    for collisions.
+    position of the job.
+
+    The procedure does not move the arm there, because such a move would not be checked for
+    collisions.
 
     Args:
         joints: number of joints of the arm.
@@ -104,7 +110,12 @@ def _checked_start(joints: int) -> Iterator[str]:
 
 def _tool(export: Export, arm: int) -> str:
     """Return RAPID's tooldata of an arm: the pad's frame on the flange, and the load of the tool if
-    the workcell states it."""
+    the workcell states it.
+
+    Args:
+        export: the job.
+        arm: index of the arm.
+    """
     robot = export.workcell.robots[arm]
     frame = _frame(robot.T_flange_pad)
     if robot.tool_load is None:
@@ -115,8 +126,13 @@ def _tool(export: Export, arm: int) -> str:
 
 
 def _load(mass: float, centre: Array, inertia: Array) -> str:
-    """Return RAPID's loaddata for a mass [kg], a centre of mass (3,) [mm] and principal moments of
-    inertia (3,) [kg m^2]."""
+    """Return RAPID's loaddata of a load.
+
+    Args:
+        mass: mass [kg].
+        centre: (3,) centre of mass [mm].
+        inertia: (3,) principal moments of inertia [kg m^2].
+    """
     return f"[{mass:.4f},{_numbers(centre)},[1,0,0,0],{_numbers(inertia)[1:-1]}]"
 
 
@@ -159,8 +175,15 @@ seems to limit the speed itself."""
 
 
 def egm_files(export: Export) -> dict[str, str | bytes]:
-    """Return the files of the target `abb-egm` by path: the program that streams the job, and the
-    RAPID code that starts EGM in the tasks of both arms."""
+    """Return the files of the target `abb-egm`: the program that streams the job, and the RAPID
+    code that starts EGM in the tasks of both arms.
+
+    Args:
+        export: the job at the target's time steps.
+
+    Returns:
+        Contents of the files by path.
+    """
     robots, follower, q = export.workcell.robots, export.follower, export.sampled.q
     J = pad_jacobians(export.workcell, follower, export.sampled.arm(follower, q))
     # Along the pad's normal, without turning it.

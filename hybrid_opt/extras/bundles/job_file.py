@@ -178,6 +178,7 @@ def pad_places(workcell: Workcell, arm: int, q: Array) -> Array:
     """Compute the poses (n, 4, 4) of an arm's pad in the world.
 
     Args:
+        workcell: the cell.
         arm: index of the arm.
         q: (n, n_joints) joint positions of this arm [rad or m].
     """
@@ -195,6 +196,7 @@ def pad_jacobians(workcell: Workcell, arm: int, q: Array) -> Array:
     the flange's axes per joint velocity [m/rad, 1].
 
     Args:
+        workcell: the cell.
         arm: index of the arm.
         q: (n, n_joints) joint positions of this arm [rad or m].
     """
@@ -353,11 +355,14 @@ class Export:
         return contact_torque(first, matrices, np.swapaxes(wrench, 0, 1))
 
     def _of_other(self, contact: Array) -> Array:
-        """Return the torques that each arm's contact causes in the joints that move both arms,
-        moved to the columns of the other arm; zero for other joints.
+        """Return the torques (n, joints) that each arm's contact causes in the joints that move
+        both arms, in the columns of the other arm [N m, for sliding joints N].
+
+        The columns of all other joints are zero.
 
         Args:
-            contact: (n, joints) torques of each arm's own contact, both arms side by side [N m].
+            contact: (n, joints) torques of each arm's own contact, both arms side by side [N m, for
+                sliding joints N].
         """
         found, (own, other) = np.zeros_like(contact), self.job.joint_names
         for name in common_joints(self.workcell.robots):
@@ -432,19 +437,31 @@ class Export:
         return found
 
     def reach(self, arm: int) -> Array:
-        """Compute for each joint the largest speed of the arm's pad per joint speed, over all
-        samples (n_joints,) [m/rad, for sliding joints 1]."""
+        """Compute the largest speed of an arm's pad per speed of each joint, over all samples.
+
+        Args:
+            arm: index of the arm.
+
+        Returns:
+            (n_joints,) one value for each joint of the arm [m/rad, for sliding joints 1].
+        """
         J = pad_jacobians(self.workcell, arm, self.sampled.arm(arm, self.sampled.q))
         return np.asarray(np.linalg.norm(J[:, :3], axis=1).max(axis=0))
 
     def ros_joints(self, arm: int) -> list[str]:
-        """Return the names of an arm's joints in ROS, with its robot's prefix."""
+        """Return the names of an arm's joints in ROS, with its robot's prefix, base first.
+
+        Args:
+            arm: index of the arm.
+        """
         prefix = prefixes(self.workcell)[arm]
         return [f"{prefix}{joint}" for joint in self.job.joint_names[arm]]
 
     @cached_property
     def document(self) -> dict[str, Any]:
-        """Content of job.json as JSON values."""
+        """Content of job.json as JSON values by key: times, phases, box poses, limits, and the
+        values of each robot.
+        """
         sampled, job = self.sampled, self.job
         orientation = self.workcell.task.orientation
         spans = map(sampled.span, range(len(job.phases)))
@@ -487,11 +504,19 @@ class Export:
 
     def tool_load(self, arm: int) -> tuple[float, Array]:
         """Return the mass [kg] and the centre of mass (3,) in the flange frame [m] of an arm's
-        tool; zeros if unknown."""
+        tool; zeros if unknown.
+
+        Args:
+            arm: index of the arm.
+        """
         load = self.workcell.robots[arm].tool_load
         return (0.0, np.zeros(3)) if load is None else (load.mass, load.centre_of_mass)
 
 
 def job_text(export: Export) -> str:
-    """Return the text of job.json."""
+    """Return the text of job.json.
+
+    Args:
+        export: the job at the target's time steps.
+    """
     return json.dumps(export.document, allow_nan=False, separators=(",", ":")) + "\n"

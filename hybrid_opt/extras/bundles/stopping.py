@@ -70,8 +70,12 @@ def stop_of(job: Job, model: TimingModel) -> Stop:
     places, x = time[::STOP_STRIDE], np.linspace(0.0, 1.0, INSTANTS)
 
     def stop(duration: float) -> Stop:
-        """Compute the largest uses of force and joint limits in stops of this duration [s] that
-        begin at many places of the path."""
+        """Compute the largest shares of force and joint limits that are used in stops along the
+        path, which begin at many places.
+
+        Args:
+            duration: duration of each stop [s].
+        """
         rate = 1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
         slope = -30.0 * x**2 * (1.0 - x) ** 2 / duration
         passed = duration * (x - 2.5 * x**4 + 3.0 * x**5 - x**6)

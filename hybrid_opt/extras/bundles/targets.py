@@ -96,7 +96,11 @@ class Target:
         self.require(job)
 
     def require_hands(self, workcell: Workcell, name: str) -> None:
-        """Check that the target with this name can switch the hands of a cell.
+        """Check that this target can switch the hands of a cell (cups, magnets or grippers).
+
+        Args:
+            workcell: the cell.
+            name: name of the target, for messages.
 
         Raises:
             SettingsError: the target switches no hands, or the names of their outputs are not valid
@@ -271,6 +275,9 @@ GONE = {
 def require_target(name: str) -> None:
     """Check that a target exists.
 
+    Args:
+        name: name of the target.
+
     Raises:
         SettingsError: the name is unknown, or the target is no longer written.
     """
@@ -283,7 +290,11 @@ def require_target(name: str) -> None:
 
 
 def target_for(name: str, workcell: Workcell) -> Target:
-    """Return the target with this name, in the variant for the drivers of the cell's arms.
+    """Return a target by name, in the variant for the drivers of the cell's arms.
+
+    Args:
+        name: name of the target.
+        workcell: the cell.
 
     Raises:
         SettingsError: the name is unknown, or no driver takes torques for these arms.
@@ -293,7 +304,8 @@ def target_for(name: str, workcell: Workcell) -> Target:
 
 
 def missing_for(name: str, workcell: Workcell, leader: int = 0) -> tuple[str, ...]:
-    """Return sentences on what a cell lacks for a target, as far as this is known before any carry.
+    """Return sentences on what a cell lacks for a target, as far as this is known without a carry;
+    empty if nothing.
 
     Args:
         name: name of the target.
@@ -326,7 +338,11 @@ def missing_for(name: str, workcell: Workcell, leader: int = 0) -> tuple[str, ..
 
 
 def missing_loads(workcell: Workcell) -> list[str]:
-    """Return a warning for each robot whose tool load is not stated."""
+    """Return a warning for each robot whose tool load is not stated; empty if all are.
+
+    Args:
+        workcell: the cell.
+    """
     return [
         f"no tool_load is given for {robot.name}: torques and tool data leave out the pad's mass"
         for robot in workcell.robots
@@ -335,7 +351,11 @@ def missing_loads(workcell: Workcell) -> list[str]:
 
 
 def missing_text(name: str, workcell: Workcell) -> str:
-    """Return the sentences of `missing_for` in a form for a terminal.
+    """Return the sentences of `missing_for` as one text for a terminal.
+
+    Args:
+        name: name of the target.
+        workcell: the cell.
 
     Raises:
         SettingsError: the target is unknown.

@@ -84,8 +84,11 @@ FRANKA_TYPES = ("fer", "fp3", "fr3", "fr3v2")
 
 
 def driver_of(workcell: Workcell) -> str:
-    """Return the name of the driver for both arms, 'franka' or 'ur'; 'simulation' if no arm has an
+    """Return the name of the driver for both arms: 'franka', 'ur', or 'simulation' if no arm has an
     address.
+
+    Args:
+        workcell: the cell.
 
     Raises:
         SettingsError: only one arm has an address, or no driver takes torques for these arms.
@@ -114,6 +117,9 @@ def driver_of(workcell: Workcell) -> str:
 def require_torque(job: Job) -> None:
     """Check, for Franka arms, that the names of the joints are those that franka_ros2 uses.
 
+    Args:
+        job: the job.
+
     Raises:
         SettingsError: the names differ, or a prefix does not end with '_'.
     """
@@ -135,7 +141,11 @@ def require_torque(job: Job) -> None:
 
 def joint_stiffness(job: Job) -> Array:
     """Return the proportional gains (joints,) of the joint controllers, both arms side by side [N
-    m/rad, for sliding joints N/m]."""
+    m/rad, for sliding joints N/m].
+
+    Args:
+        job: the job.
+    """
     largest = job.workcell.stack_joint_limits("torque_max")
     return np.minimum(GAIN * largest, FASTEST**2 * joint_inertia(job))
 
@@ -158,8 +168,14 @@ def pad_stiffness(job: Job) -> float:
 
 
 def torque_files(export: Export) -> dict[str, str | bytes]:
-    """Return the files of the target `torque` by path: programs, controllers, and
-    `config/cell.json` with the settings of the driver.
+    """Return the files of the target `torque`: programs, controllers, and `config/cell.json` with
+    the settings of the driver.
+
+    Args:
+        export: the job at the target's time steps.
+
+    Returns:
+        Contents of the files by path.
 
     Raises:
         SettingsError: a torque changes faster than libfranka accepts.
@@ -206,8 +222,16 @@ def torque_files(export: Export) -> dict[str, str | bytes]:
 
 
 def _grip(export: Export, arm: int) -> dict[str, Any]:
-    """Return the service calls that switch the hands of an arm on and off, and the topic on which
-    the hands report that they hold."""
+    """Return how the hands of an arm are switched and watched in ROS.
+
+    Args:
+        export: the job.
+        arm: index of the arm.
+
+    Returns:
+        Name and type of the service, the requests `on` and `off`, and under `input` the topic on
+        which the hands report that they hold, None if there is none.
+    """
     driver = export.workcell.robots[arm].driver
     io = f"/{_values(export, arm)['space']}/io_and_status_controller"
     if driver.grip_output.isdecimal():
@@ -289,7 +313,15 @@ def joint_inertia(job: Job) -> Array:
 
 
 def _values(export: Export, arm: int) -> dict[str, Any]:
-    """Return those values for an arm's template that all drivers need, by name."""
+    """Return the values for an arm's template that all drivers need.
+
+    Args:
+        export: the job.
+        arm: index of the arm.
+
+    Returns:
+        Values by name of the placeholder.
+    """
     robot, prefix = export.workcell.robots[arm], prefixes(export.workcell)[arm]
     mass, centre = export.tool_load(arm)
     spaces = [prefix.rstrip("_") for prefix in prefixes(export.workcell)]
@@ -309,8 +341,14 @@ def _values(export: Export, arm: int) -> dict[str, Any]:
 
 
 def _franka(export: Export, arm: int) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Return the values for a Franka arm's template by name, and the parameters of its
-    broadcasters.
+    """Return the values for a Franka arm's template, and the parameters of its broadcasters.
+
+    Args:
+        export: the job.
+        arm: index of the arm.
+
+    Returns:
+        Values by name of the placeholder; and parameters by name of the controller.
 
     Raises:
         SettingsError: a torque changes faster than libfranka accepts.
@@ -343,7 +381,7 @@ def _franka(export: Export, arm: int) -> tuple[dict[str, Any], dict[str, dict[st
 
 
 def _franka_type(joints: Sequence[str]) -> str:
-    """Return TYPE if the joints are called TYPE_joint1 to TYPE_joint7, else ''."""
+    """Return TYPE if an arm's joints are called TYPE_joint1 to TYPE_joint7, else ''."""
     kind = joints[0].removesuffix("_joint1")
     return kind if list(joints) == [f"{kind}_joint{k}" for k in range(1, 8)] else ""
 
@@ -368,8 +406,16 @@ def _contact(job: Job, arm: int) -> tuple[Array, tuple[float, float]]:
 
 
 def _ur(export: Export, arm: int) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Return the values for a Universal Robots arm's template by name, and the parameters of its
-    broadcasters."""
+    """Return the values for a Universal Robots arm's template, and the parameters of its
+    broadcasters.
+
+    Args:
+        export: the job.
+        arm: index of the arm.
+
+    Returns:
+        Values by name of the placeholder; and parameters by name of the controller.
+    """
     found = re.search(UR_TYPE, described(export.workcell.robots[arm]))
     values = _values(export, arm)
     prefix = values["prefix"]

@@ -47,7 +47,10 @@ gives this limit to force_mode."""
 
 
 def require_followed(job: Job) -> None:
-    """Check that the pads move along their normals no faster than URScript's force mode can follow.
+    """Check that URScript's force mode can follow the motion of the pad along its normal.
+
+    Args:
+        job: the job.
 
     Raises:
         SettingsError: the carry is too fast; the message states the speed and remedies.
@@ -70,7 +73,12 @@ def require_followed(job: Job) -> None:
 
 
 def normal_speed(job: Job, arm: int) -> float:
-    """Return the largest speed of an arm's pad along its normal while the box is held [m/s]."""
+    """Return the largest speed of an arm's pad along its normal while the box is held [m/s].
+
+    Args:
+        job: the job.
+        arm: index of the arm.
+    """
     contact, orientation = job.workcell.contacts[arm], job.workcell.task.orientation
     fastest = 0.0
     for phase in job.held:
@@ -85,11 +93,14 @@ def normal_speed(job: Job, arm: int) -> float:
 
 
 def urscript_files(export: Export) -> dict[str, str | bytes]:
-    """Return the URScript programs of both arms, by path.
+    """Return the URScript programs of both arms, as texts by path.
+
+    Args:
+        export: the job at the target's time steps.
 
     Raises:
         SettingsError: the time step is not a multiple of the controller's cycle that fills every
-            phase.
+            phase, or there are too many points.
     """
     steps = np.diff(export.sampled.time)
     cycles = float(steps.mean()) / CYCLE
@@ -175,8 +186,13 @@ def _phase(export: Export, arm: int, index: int, name: str) -> Iterator[str]:
 
 
 def _payload(export: Export, arm: int) -> str:
-    """Return the arguments of URScript's set_target_payload: mass of the arm's tool [kg], and its
-    centre of mass in the flange frame [m]."""
+    """Return the arguments of URScript's set_target_payload: the mass of an arm's tool [kg], and
+    its centre of mass in the flange frame [m].
+
+    Args:
+        export: the job.
+        arm: index of the arm.
+    """
     mass, centre = export.tool_load(arm)
     return f"{mass:.4f}, {_list(centre)}"
 

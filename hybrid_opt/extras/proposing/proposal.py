@@ -282,9 +282,7 @@ def propose_classes(
 
 @dataclass
 class _Lazy:
-    """A choice of robot bases, `given` as keys of the problem file, that is prepared at its first
-    use.
-    """
+    """A choice of bases, `given` as keys of the problem file, prepared at its first use."""
 
     given: dict[str, Any]
     spins: Array
@@ -294,9 +292,7 @@ class _Lazy:
 
 @dataclass
 class _Search:
-    """The state of one search for proposals: its settings, the refused paths, and the classes
-    found.
-    """
+    """The state of one search for proposals: settings, refused paths, and the classes found."""
 
     problem: Problem
     rng: np.random.Generator

@@ -8,7 +8,12 @@ from string import Template
 
 
 def program(name: str) -> str:
-    """Return the text of a program that is copied into bundles unchanged."""
+    """Return the text of a program that is copied into bundles, with imports changed to its folder
+    there.
+
+    Args:
+        name: file name of the program.
+    """
     text = (files(__name__) / name).read_text("utf-8")
     return text.replace(f"from {__name__}.", "from ")
 
@@ -31,9 +36,12 @@ SHARED = ("bring_up.py", "carry_job.py", "carry_machine.py")
 
 
 def programs(name: str) -> dict[str, str]:
-    """Return the texts of a program that runs a job and of the modules that it imports, by path.
+    """Return a program that runs a job, and the modules that it imports.
 
     Args:
-        name: name of the program.
+        name: file name of the program.
+
+    Returns:
+        Texts of the files by path.
     """
     return {each: program(each) for each in (name, *SHARED)}

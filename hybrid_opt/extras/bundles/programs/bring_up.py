@@ -86,8 +86,9 @@ class Measured:
 
 
 def unloaded(job: Job) -> Job:
-    """Return the job without contact forces, with hands that stay off and with wider limits on
-    delays, for a run without a box."""
+    """Return a copy of a job for a run without a box: without contact forces, with hands that stay
+    off, and with wider limits on delays.
+    """
     robots = []
     for robot in job.robots:
         contact = robot["hold_effort_without_gravity"]
@@ -106,7 +107,7 @@ def unloaded(job: Job) -> Job:
 
 
 def pressing(job: Job) -> Job:
-    """Return the part of a job up to the end of the phase `press`, slowed down."""
+    """Return the part of a job up to the end of the phase `press`, `SLOWER` times slower."""
     count = 1 + next(i for i, each in enumerate(job.document["phases"]) if each["name"] == "press")
     phases = job.document["phases"][:count]
     end = phases[-1]["last"] + 1
@@ -171,7 +172,7 @@ class Looks:
 
         Args:
             now: time of the measurement [s].
-            machine: state of the job.
+            machine: state machine of the job, with the commanded place on the path.
             seen: measured state of the arms.
             raw: reading of each arm's force sensor [N]; None without a sensor.
             way: distance of the pressing pad beyond its planned position [m]; NaN if unknown.
@@ -196,8 +197,13 @@ class Looks:
         return median(self.forces[arm]) if self.forces[arm] else nan
 
     def speed(self, job: Job, arm: int) -> float:
-        """Return the largest measured speed of an arm's pad, over the largest planned speed of that
-        pad."""
+        """Return the largest measured speed of an arm's pad, divided by the largest planned speed
+        of this pad.
+
+        Args:
+            job: the job that was run.
+            arm: index of the arm.
+        """
         reach, found = job.robots[arm]["reach"], [0.0]
         for one, other in zip(self.moving, self.moving[WINDOW:], strict=False):
             passed = other.time - other.age[arm] - one.time + one.age[arm]
@@ -210,7 +216,12 @@ class Looks:
 
     def late(self, job: Job, arm: int) -> float:
         """Return the median delay of an arm's measured posture behind the commanded place on the
-        path [s]."""
+        path [s]; NaN without measurements.
+
+        Args:
+            job: the job that was run.
+            arm: index of the arm.
+        """
         fastest, found = max(job.speed(arm, s) for s in job.time), []
         for look in self.moving:
             forward = look.direction
@@ -271,8 +282,12 @@ class Looks:
 
 
 def add_options(parser: ArgumentParser) -> None:
-    """Add options to a program that runs a job: check only, move without a box, or measure both
-    arms."""
+    """Add the options of a program that runs a job: check only, move without a box, or measure both
+    arms.
+
+    Args:
+        parser: parser of the program's arguments, which is extended.
+    """
     group = parser.add_mutually_exclusive_group()
     for name, text in (
         ("--check", "look at both arms and move nothing"),
@@ -285,14 +300,16 @@ def add_options(parser: ArgumentParser) -> None:
 def bring_up(
     folder: Path, job: Job, plan: dict[str, Any], drive: Callable[[Job, str], bool], looks: Looks
 ) -> int:
-    """Measure both arms and write the results into a bundle's folder. Return the exit code.
+    """Measure both arms and write the results into a bundle's folder. Return the exit code of the
+    program.
 
     Args:
         folder: folder of the bundle.
         job: the job.
         plan: planned values, as in the configuration of the bundle.
-        drive: function that runs a job to its end and back once somebody has typed the given word,
-            stores measurements in `looks`, and returns True if the run was completed.
+        drive: function that takes a job and a word. It waits until somebody types the word, runs
+            the job to its end and back, stores measurements in `looks`, and returns True if the run
+            was completed.
         looks: store of the measurements.
 
     Raises:
@@ -325,7 +342,12 @@ def require(folder: Path, job: Job, plan: dict[str, Any]) -> list[Measured]:
     plan.
 
     Args:
+        folder: folder of the bundle.
+        job: the job.
         plan: planned values, as in the configuration of the bundle.
+
+    Returns:
+        The measured properties of each arm.
 
     Raises:
         Refused: nothing was measured, or a value differs too much from the plan.

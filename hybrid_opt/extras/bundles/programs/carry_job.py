@@ -70,7 +70,7 @@ class Limits:
 
 @dataclass(frozen=True)
 class Switch:
-    """A phase of a job in which hands are switched on or off.
+    """A phase of a job in which hands (cups, magnets, grippers) are switched on or off.
 
     Attributes:
         begin, end: planned time at which the phase begins, and ends [s].
@@ -95,6 +95,9 @@ class Job:
     def __init__(self, document: dict[str, Any]) -> None:
         """Store a document and check its format.
 
+        Args:
+            document: content of job.json.
+
         Raises:
             Refused: the document is not a job, or has another version.
         """
@@ -117,6 +120,9 @@ class Job:
     @classmethod
     def read(cls, path: Path) -> Job:
         """Read the job from a file.
+
+        Args:
+            path: path of job.json.
 
         Raises:
             Refused: the file cannot be read.
@@ -158,8 +164,8 @@ class Job:
         """Return True if the box may already stand on its support although the set-down is not
         finished.
 
-        This is so if s is in the set-down, the planned place of the box is at most `TOUCH` from the
-        one at the end of the set-down, and `stand` has not been called.
+        This is so if s is in the set-down, if the planned place of the box is at most `TOUCH` from
+        its place at the end of the set-down, and if `stand` has not been called.
 
         Args:
             s: planned time [s].
@@ -176,7 +182,7 @@ class Job:
         later references are shifted accordingly.
 
         While the commanded forces decrease, the references of the arms move to the measured
-        positions. So soft arms release the box too.
+        positions. So arms that give way under force release the box as well.
 
         Args:
             s: planned time, within the set-down, at which the box stands [s].
@@ -236,8 +242,13 @@ class Job:
         return k, min(max((s - self.time[k]) / step, 0.0), 1.0), step
 
     def position(self, arm: int, s: float) -> list[float]:
-        """Interpolate the planned joint positions of an arm at a planned time s [s], by cubic
-        polynomials [rad, or m for sliding joints]."""
+        """Interpolate the planned joint positions of an arm by cubic polynomials [rad, or m for
+        sliding joints].
+
+        Args:
+            arm: index of the arm.
+            s: planned time [s].
+        """
         k, x, step = self._place(s)
         q, v = self.robots[arm]["position"], self.robots[arm]["velocity"]
         a, b = (1.0 + 2.0 * x) * (1.0 - x) ** 2, x * (1.0 - x) ** 2 * step
@@ -254,17 +265,24 @@ class Job:
         return found
 
     def linear(self, arm: int, name: str, s: float) -> list[float]:
-        """Interpolate values of an arm at a planned time s [s] linearly between samples.
+        """Interpolate values of an arm linearly between samples, in the unit of the document.
 
         Args:
+            arm: index of the arm.
             name: key of the values in the arm's part of the document.
+            s: planned time [s].
         """
         k, x, _ = self._place(s)
         rows = self.robots[arm][name]
         return [(1.0 - x) * a + x * b for a, b in zip(rows[k], rows[k + 1], strict=True)]
 
     def force(self, arm: int, s: float) -> float:
-        """Return the commanded normal force of an arm at a planned time s [s], in newtons."""
+        """Return the commanded normal force of an arm [N].
+
+        Args:
+            arm: index of the arm.
+            s: planned time [s].
+        """
         k, x, _ = self._place(s)
         rows = self.robots[arm]["normal_force"]
         return float((1.0 - x) * rows[k] + x * rows[k + 1])
@@ -298,8 +316,12 @@ class Job:
         return float(sum(r * abs(a - b) for r, a, b in zip(reach, q, planned, strict=True)))
 
     def speed(self, arm: int, s: float) -> float:
-        """Return an upper bound of the planned speed of an arm's pad at a planned time s [s], in
-        m/s."""
+        """Return an upper bound of the planned speed of an arm's pad [m/s].
+
+        Args:
+            arm: index of the arm.
+            s: planned time [s].
+        """
         rates = self.linear(arm, "velocity", s)
         reach = self.robots[arm]["reach"]
         return float(sum(r * abs(v) for r, v in zip(reach, rates, strict=True)))

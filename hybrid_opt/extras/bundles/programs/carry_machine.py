@@ -79,16 +79,23 @@ class Clock:
         self._from, self._to, self._since = rate, rate, 0.0
 
     def keep(self, low: float, high: float) -> None:
-        """Limit the planned time of the commanded place to the range from `low` to `high` [s]."""
+        """Limit the planned time of the commanded place to a range.
+
+        Args:
+            low, high: ends of the range [s].
+        """
         self._low, self._high = low, high
 
     @property
     def turning(self) -> bool:
-        """True while the rate changes, at which the commanded place moves on the path."""
+        """True while the rate changes; the rate is the derivative of the planned time with respect
+        to time.
+        """
         return self._from != self._to
 
     def turn(self, rate: float, after: float = 0.0, takes: float | None = None) -> None:
-        """Start a smooth change of the rate, at which the commanded place moves on the path.
+        """Start a smooth change of the rate, the derivative of the planned time with respect to
+        time.
 
         Args:
             rate: rate after the change: 1 for the planned speed, 0 for rest, -1 for backwards.
@@ -100,8 +107,12 @@ class Clock:
             self._takes = self._stop_time if takes is None else takes
 
     def advance(self, dt: float) -> None:
-        """Move the commanded place on for dt [s]. The result does not depend on the number of calls
-        into which a time is divided."""
+        """Move the commanded place on for a time step. Dividing the step into several calls changes
+        nothing.
+
+        Args:
+            dt: time step [s].
+        """
         count = max(1, math.ceil(dt / FINE)) if self.turning else 1
         for _ in range(count):
             self._step(dt / count)
@@ -252,7 +263,11 @@ class Machine:
                 )
 
     def hold(self, reason: str) -> None:
-        """Hold the present commanded posture because the arms cannot continue."""
+        """Hold the present commanded posture because the arms cannot continue.
+
+        Args:
+            reason: reason, for the status.
+        """
         self.clock = Clock(self.job.end, self.job.limits.stop_time, self.clock.s)
         self.state, self.reason = "held", reason
 
@@ -297,7 +312,7 @@ class Machine:
         self._next_gate()
 
     def _next_gate(self) -> None:
-        """Let the clock run to the next place at which it has to wait for hands."""
+        """Let the clock run to the next place at which it has to wait for a switch of hands."""
         self._waited = 0.0
         low, high = 0.0, self.job.end
         if self._gates and self._direction > 0.0:
@@ -327,7 +342,7 @@ class Machine:
             self.hold(f"{self._grip(late[0], seen)} after {self.job.limits.grip:g} s")
 
     def tick(self, dt: float, seen: Seen) -> None:
-        """Advance the time by dt [s]. Stop or hold the job if the measured state of the arms
+        """Advance the job by one time step. Stop or hold it if the measured state of the arms
         requires it.
 
         Args:
@@ -422,7 +437,12 @@ class Machine:
         return f"keep their hands switched {'on' if self.grip else 'off'}"
 
     def _grip(self, arm: int, seen: Seen) -> str:
-        """Return a text that says what the input of an arm's hands reports."""
+        """Return a text that says what the input of an arm's hands reports.
+
+        Args:
+            arm: index of the arm.
+            seen: measured state of both arms.
+        """
         if seen.grip[arm] is None:
             return f"nothing is heard of the input of {self._name(arm)}'s hands"
         return f"the hands of {self._name(arm)} {'hold' if seen.grip[arm] else 'do not hold'}"
@@ -442,8 +462,12 @@ class Machine:
                 )
 
     def _wrong(self, seen: Seen) -> str:
-        """Return the reason why the measured state of the arms does not allow to continue, '' if it
-        does. The size of forces is checked by `_wrong_force` alone."""
+        """Return the reason for which the measured postures and inputs do not allow the job to
+        continue, '' if they do. `_wrong_force` checks the forces.
+
+        Args:
+            seen: measured state of both arms.
+        """
         limits, s = self.job.limits, self.clock.s
         # Nothing is lifted, and no job done, by an arm that stands elsewhere.
         stands = self.job.is_gripped(s) or s in (0.0, self.job.end)
@@ -484,7 +508,12 @@ class Machine:
         return ""
 
     def _wrong_force(self, seen: Seen) -> str:
-        """Return the reason why the measured forces do not allow to continue, '' if they do."""
+        """Return the reason for which the measured forces do not allow the job to continue, '' if
+        they do.
+
+        Args:
+            seen: measured state of both arms.
+        """
         s, lift = self.clock.s, self.job.pressed
         for arm, measured in enumerate(seen.force):
             wanted = self.job.force(arm, s)

@@ -21,14 +21,22 @@ BUNDLE = Path(__file__).resolve().parent.parent
 
 
 def generate_launch_description() -> Any:
-    """Launch what each entry under `launch` lists."""
+    """Return the launch description of both arms, with all entries under `launch` of
+    config/cell.json.
+    """
     config = json.loads((BUNDLE / "config/cell.json").read_text())
     return LaunchDescription([action for each in config["launch"] for action in actions(each)])
 
 
 def actions(each: dict[str, Any]) -> list[Any]:
-    """Return the launch actions of one entry: a driver's launch file or a robot description, a
-    controller manager, and its controllers."""
+    """Return the launch actions of one entry of config/cell.json.
+
+    They start a driver's launch file or a robot description, a controller manager, and its
+    controllers.
+
+    Args:
+        each: the entry.
+    """
     parameters: list[Any] = [str(BUNDLE / name) for name in each["parameters"]]
     outside, inside = list[Any](), list[Any]()
     if each["namespace"]:

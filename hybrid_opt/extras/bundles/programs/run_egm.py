@@ -158,7 +158,11 @@ class Stream:
         self.dropped = 0
 
     def seen(self, now: float) -> Seen:
-        """Return the measured state of the arms."""
+        """Return the measured state of the arms.
+
+        Args:
+            now: time [s].
+        """
         age = [now - then for then in self._news]
         q = list(self._q)
         pressing = q[self._arm]
@@ -176,8 +180,13 @@ class Stream:
         return Seen(q=q, force=force, age=age, fault=self.fault, lost=lost)
 
     def hear(self, arm: int, message: FromRobot, now: float) -> None:
-        """Store the measured state in a message from an arm's controller that arrived at the time
-        `now` [s]."""
+        """Store the measured state in a message from an arm's controller.
+
+        Args:
+            arm: index of the arm.
+            message: the message.
+            now: time of its arrival [s].
+        """
         degrees = self._in_chain(arm, message.joints, message.further)
         if degrees is None:
             return
@@ -285,7 +294,11 @@ class Stream:
 
     def _inward(self, s: float) -> list[float]:
         """Compute the motion of each joint of the pressing arm per motion of its pad along the
-        normal, at a planned time s [s] [rad/m]."""
+        normal [rad/m].
+
+        Args:
+            s: planned time of the place on the path [s].
+        """
         rows, time = self.config["inward"], self.job.time
         k = min(max(bisect_left(time, s) - 1, 0), len(rows) - 2)
         share = min(max((s - time[k]) / (time[k + 1] - time[k]), 0.0), 1.0)
@@ -316,7 +329,11 @@ class Stream:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Stream the job. Return the exit code, 0 when the job is done."""
+    """Stream the job to both arms. Return the exit code, 0 when the job is done.
+
+    Args:
+        arguments: arguments of the command line; None for those of this process.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     add_options(parser)
     options = parser.parse_args(arguments)
@@ -404,7 +421,11 @@ def streamed(
 
 
 def received(source: socket.socket) -> Iterator[tuple[bytes, Any]]:
-    """Yield the packets that wait in a socket, each as content and address of the sender."""
+    """Yield the content and the sender's address of each packet that waits in a socket.
+
+    Args:
+        source: the socket.
+    """
     with suppress(BlockingIOError):
         while True:
             yield source.recvfrom(4096, socket.MSG_DONTWAIT)
@@ -437,6 +458,9 @@ class FromRobot:
 
 def read_robot(data: bytes) -> FromRobot:
     """Decode a message from a controller.
+
+    Args:
+        data: content of the packet.
 
     Raises:
         ValueError: the bytes are not such a message.
@@ -492,8 +516,15 @@ def _doubles(data: bytes, numbers: tuple[int, ...]) -> tuple[float, ...]:
 
 
 def _fields(data: bytes) -> Iterator[tuple[int, int | bytes]]:
-    """Yield number and value of each field of a protobuf message: varints as integers, all others
-    as bytes."""
+    """Yield number and value of each field of a protobuf message. Values of varints are integers,
+    all others bytes.
+
+    Args:
+        data: the encoded message.
+
+    Raises:
+        ValueError: the bytes are not a message.
+    """
     place = 0
     while place < len(data):
         key, place = _varint(data, place)

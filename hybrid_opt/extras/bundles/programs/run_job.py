@@ -79,13 +79,21 @@ def parts(time: float) -> tuple[int, int]:
 
 
 def type_of(kind: str) -> Any:
-    """Return the type of a message or service by its name PACKAGE/msg/NAME or PACKAGE/srv/NAME."""
+    """Return the Python class of a ROS message or service.
+
+    Args:
+        kind: its name, PACKAGE/msg/NAME or PACKAGE/srv/NAME.
+    """
     package, what, name = kind.split("/")
     return getattr(import_module(f"{package}.{what}"), name)
 
 
 def fill(message: Any, values: dict[str, Any]) -> None:
     """Set the fields of a message from a dictionary.
+
+    Args:
+        message: the message, which is changed.
+        values: values by name of the field; a dictionary for a field that is a message.
 
     Raises:
         AttributeError: the message has no such field.
@@ -158,8 +166,7 @@ class Run:
                 self._measured[arm] = self._stamp(message)
 
     def _stamp(self, message: Any) -> float:
-        """Return the time at which a message was measured [s], or the time of arrival if it has no
-        stamp."""
+        """Return the time stamp of a message [s], or the present time if it has none."""
         stamp = message.header.stamp
         return stamp.sec + 1e-9 * stamp.nanosec or self.now()
 
@@ -250,10 +257,11 @@ class Run:
             rclpy.spin_once(self.node, timeout_sec=left)
 
     def wait(self, futures: Sequence[Any], what: str) -> list[Any]:
-        """Wait for futures and return their results.
+        """Wait for futures and return their results, in the same order.
 
         Args:
-            what: what is awaited, for the message.
+            futures: the futures.
+            what: name of what is awaited, for the message.
 
         Raises:
             Refused: they take longer than `PATIENCE`.
@@ -291,7 +299,15 @@ class Run:
         return future
 
     def _find(self, name: str, kind: str) -> None:
-        """Find a service, so that a missing one is noticed before anything moves."""
+        """Find a service, so that a missing one is noticed before anything moves.
+
+        Args:
+            name: name of the service.
+            kind: type of the service.
+
+        Raises:
+            Refused: there is no such service.
+        """
         self._clients[name] = self.node.create_client(type_of(kind), name)
         if not self._clients[name].wait_for_service(timeout_sec=PATIENCE):
             raise Refused(f"{name} is not there; are the controllers launched?")
@@ -369,12 +385,15 @@ class Run:
         return FollowJointTrajectory.Goal(trajectory=trajectory)
 
     def _joined(self, arms: Sequence[int], rows: Sequence[Sequence[Any]]) -> list[Any]:
-        """Join the values of several arms' joints to one list per row. A joint that moves both arms
-        is taken from the first of them.
+        """Join the values of several arms' joints to one list. A joint that moves both arms is
+        listed once, with its value of the first arm.
 
         Args:
             arms: indices of the arms.
             rows: for each arm the values of its joints.
+
+        Returns:
+            One value for each joint, in the order of the arms.
         """
         found: dict[str, Any] = {}
         for arm, row in zip(arms, rows, strict=True):
@@ -465,7 +484,7 @@ class Run:
 
     def drive(self, part: Job, word: str) -> bool:
         """Run a part of the job to its end and back, after somebody has typed a word. Return True
-        if it was completed.
+        if this run was completed.
 
         Args:
             part: the part of the job.
@@ -523,7 +542,11 @@ class Run:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the job. Return the exit code, 0 when the job is done."""
+    """Run the job. Return the exit code, 0 when the job is done.
+
+    Args:
+        arguments: arguments of the command line; None for those of this process.
+    """
     parser = argparse.ArgumentParser(description=__doc__)
     add_options(parser)
     options = parser.parse_args(arguments)
