@@ -134,6 +134,9 @@ def _ways(workcell: Workcell) -> Array:
     """Compute the directions along the pads' faces in the box frame (2, 3): upwards at the start,
     then level.
 
+    Args:
+        workcell: the cell.
+
     Raises:
         SettingsError: the faces are not upright.
     """
@@ -151,6 +154,7 @@ def _changes(workcell: Workcell, ways: Array, at: tuple[float, float]) -> dict[s
     for `Cell.changed`.
 
     Args:
+        workcell: the cell.
         ways: (2, 3) unit vectors in the box frame, upwards and level.
         at: shift along each of these vectors [m].
     """

@@ -94,6 +94,9 @@ class Sweep:
 def read_sweep(file: Path) -> Sweep:
     """Read a stored sweep.
 
+    Args:
+        file: path of the file.
+
     Raises:
         ResultsError: the file cannot be read or is damaged.
     """
@@ -104,6 +107,7 @@ def require_keys(cell: Cell, over: Mapping[str, Sequence[float]]) -> None:
     """Check, before any work, that a cell has the keys of a sweep.
 
     Args:
+        cell: the cell.
         over: values of each key that are combined.
 
     Raises:
@@ -177,7 +181,7 @@ def sweep(
 
 
 class _Chains:
-    """Combinations of a sweep with the results so far, arranged in chains. Within a chain only the
+    """Combinations of a sweep with their results so far, arranged in chains. In a chain only the
     value of the last key varies.
 
     Attributes:
@@ -196,13 +200,27 @@ class _Chains:
         self._write()
 
     def left(self, column: float) -> list[tuple[float, ...]]:
-        """Return the unfinished combinations whose last key has the value `column`."""
+        """Return the unfinished combinations whose last key has a given value, as tuples of all
+        keys' values.
+
+        Args:
+            column: value of the last key.
+        """
         every = [(*head, column) for head in self._heads]
         return [values for values in every if values not in self.done]
 
     def near(self, values: tuple[float, ...]) -> Array | None:
-        """Return the decision vector (n_var,) of the carry that was found for the nearest
-        combination before this one in its chain; None if there is none."""
+        """Return the carry found for a neighbour of a combination; None if there is none.
+
+        The neighbour differs in the last key only. It is the nearest finished one before the
+        combination.
+
+        Args:
+            values: values of the combination.
+
+        Returns:
+            (n_var,) decision vector of the neighbour's carry.
+        """
         *head, last = values
         for value in reversed(self.columns[: self.columns.index(last)]):
             if len(x := self.done[*head, value].x):
@@ -210,7 +228,11 @@ class _Chains:
         return None
 
     def store(self, row: Combination) -> None:
-        """Add the result of a combination, and write the file of the sweep."""
+        """Add the result of a combination, and write the file of the sweep.
+
+        Args:
+            row: the result.
+        """
         self.done[row.values] = row
         self._write()
 
@@ -244,8 +266,14 @@ _LOADED: dict[tuple[Any, ...], Cell] = {}
 
 
 def _loaded(cell: Cell) -> Cell:
-    """Return the equal cell that is kept from an earlier call in this process, if there is one,
-    else the given cell. So its functions are loaded once."""
+    """Return the cell of an earlier call in this process that equals the given one, else the given
+    one.
+
+    So the functions of a cell are loaded once.
+
+    Args:
+        cell: the cell.
+    """
     key = cell.workcell.digest, *cell.objectives
     if key not in _LOADED:
         _LOADED.clear()
@@ -259,7 +287,7 @@ def _next_row(
     """Compute the result of one combination.
 
     Args:
-        request: data that all combinations share.
+        request: data that all combinations share, such as the unchanged cell.
         combination: the values, and the decision vector (n_var,) of the carry of a similar
             combination, or None.
     """

@@ -68,7 +68,7 @@ class SessionVerdict:
     Attributes:
         cell: the changed cell in its drivable form; None if the change is refused.
         carry: the carry in the changed cell; None if the change is refused.
-        text: verdict as a text, with the reason if the carry is not feasible.
+        text: text that says whether the carry is feasible, with the reason if it is not.
         feasible: True if the carry is feasible.
         commanded: (n, 2) commanded normal force of each arm at the samples [N]; None if the carry
             is not feasible.
@@ -153,8 +153,8 @@ class Session:
     def optimise(
         self, rng: np.random.Generator, evaluations: int = SEARCH_EVALUATIONS
     ) -> SessionVerdict:
-        """Search around the present carry for one with a smaller product of duration and force, and
-        make it the present carry.
+        """Search near the present carry for a carry with a smaller product of duration and force.
+        The result becomes the present carry, and its verdict is returned.
 
         Args:
             rng: random generator of the search.
@@ -240,7 +240,11 @@ class Session:
 
 def handles(workcell: Workcell) -> tuple[Handle, ...]:
     """Return the parts of a cell that can be dragged: start, goal, bodies of the environment, bases
-    and pads."""
+    and pads, in this order.
+
+    Args:
+        workcell: the cell.
+    """
     task, bodies = workcell.task, workcell.environment
     first, last = (
         box_placement(task.orientation, task.waypoints[k].lower[:POSE_SIZE]) for k in (0, -1)
@@ -264,6 +268,7 @@ def moved(workcell: Workcell, handle: Handle, pose: Array) -> dict[str, Any]:
     """Return the changes of the workcell file that move a part of the cell.
 
     Args:
+        workcell: the cell.
         handle: the part.
         pose: (4, 4) its new pose in the world.
 
@@ -450,7 +455,11 @@ class Workbench:
         field.on_update(lambda _: self.ask({key: field.value}))
 
     def _grasp(self, handle: Handle | None) -> None:
-        """Show the arrows for dragging at one part of the cell; at none for None."""
+        """Show the arrows for dragging at one part of the cell, and remove those shown before.
+
+        Args:
+            handle: the part; None for no arrows.
+        """
         if self._gizmo is not None:
             self._gizmo.remove()
             self._gizmo = None
@@ -525,7 +534,11 @@ class Workbench:
         self._pose()
 
     def _draw(self, verdict: SessionVerdict) -> None:
-        """Redraw the meshes of bodies that are new, or whose shape or pose has changed."""
+        """Redraw the meshes of bodies that are new, or whose shape or pose has changed.
+
+        Args:
+            verdict: verdict on the changed cell, which contains its geometry.
+        """
         assert verdict.cell is not None
         self._geometry = verdict.cell.geometry
         scene = self._server.scene
@@ -563,6 +576,7 @@ def live(cell: Cell, port: int = 8080, x: Array | None = None) -> Workbench:
     """Open a page in the browser on which a cell is changed by hand.
 
     Args:
+        cell: the cell.
         port: port of the page; if it is in use, a free one is taken.
         x: (n_var,) decision vector of a carry of `cell.drivable()`; None for the hand-made carry.
 

@@ -97,17 +97,19 @@ class Load:
 
     @property
     def is_mass_observable(self) -> bool:
-        """True if the holds determine the mass."""
+        """True if the holds determine the mass accurately."""
         return bool(self.deviations[0] <= SEEN_MASS * abs(self.mass))
 
     @property
     def observable_centre(self) -> Array:
-        """(3,) True for each box axis along which the holds determine the centre of mass."""
+        """(3,) True for each box axis along which the holds determine the centre of mass
+        accurately.
+        """
         return np.asarray(self.deviations[1:4] <= SEEN_CENTRE)
 
     @property
     def observable_crosstalk(self) -> Array:
-        """(2, 2) True for each entry of `crosstalk` that the holds determine."""
+        """(2, 2) True for each entry of `crosstalk` that the holds determine accurately."""
         return np.asarray(self.deviations[4:].reshape(2, 2) <= SEEN_CROSSTALK)
 
 
@@ -116,7 +118,7 @@ def fit_load(holds: Sequence[MeasuredHold], moments: bool = True) -> Load:
     least squares.
 
     Args:
-        holds: at least one hold.
+        holds: at least one hold, the measurement of a box held still.
         moments: True if the sensors measure moments; the centre of mass is unknown without them.
     """
     rows, values, forces = [], [], []
@@ -155,8 +157,12 @@ def fit_load(holds: Sequence[MeasuredHold], moments: bool = True) -> Load:
 def _balance(hold: MeasuredHold) -> tuple[Array, Array, Array]:
     """Return the balance of forces and moments of a hold, Eqs. (1) and (2), as a linear system.
 
+    Args:
+        hold: the measurement of a box held still.
+
     Returns:
-        Matrix (6, unknowns), right side (6,), and covariance (6, 6) of the right side.
+        Matrix (6, unknowns), right side (6,), and covariance (6, 6) of the right side. The unknowns
+        are those of `Load`.
     """
     matrix, value, noise = np.zeros((6, len(WIDTHS))), np.zeros(6), np.zeros((6, 6))
     matrix[:3, 0] = hold.gravity

@@ -123,7 +123,7 @@ class Evidence:
 
     @property
     def changes(self) -> dict[str, Any]:
-        """All changes of the workcell file, by table."""
+        """All changes of the workcell file: new values by table of the file and key."""
         if not self.ranges:
             return self.tables
         # A stated table takes what it does not name for exact.
@@ -141,7 +141,9 @@ class Evidence:
 
     @property
     def document(self) -> dict[str, Any]:
-        """The runs, results, faults, requests and changes as JSON values."""
+        """The runs, results, faults, requests for further recordings, and changes, as JSON values
+        by name.
+        """
         return {
             "runs": list(self.runs),
             "entries": [vars(entry) for entry in self.entries],
@@ -153,6 +155,10 @@ class Evidence:
 
 def calibrate(workcell: Workcell, runs: Sequence[Recording]) -> Evidence:
     """Determine sensors, payload, friction and force tracking of a cell from recorded runs.
+
+    Args:
+        workcell: the cell.
+        runs: recorded runs, all with the same box.
 
     Raises:
         SettingsError: the runs have boxes of different weight.
@@ -197,6 +203,9 @@ def _pieces(run: Recording, places: Places) -> list[MeasuredHold]:
     Args:
         run: the run.
         places: pad poses and wrenches of the run.
+
+    Returns:
+        Mean measurement of each piece.
     """
     found = []
     for begin, end in run.labels.held:
@@ -249,6 +258,7 @@ def _load(sound: Sound, evidence: Evidence) -> Load | None:
     are no holds, or the holds have faults.
 
     Args:
+        sound: recordings without serious faults, each with its pad poses and wrenches.
         evidence: the results, to which the values are added.
     """
     holds, moments = [], True
@@ -316,10 +326,13 @@ def _load(sound: Sound, evidence: Evidence) -> Load | None:
 
 
 def _friction(sound: Sound, load: Load | None, evidence: Evidence) -> None:
-    """Bracket the friction coefficient between the greatest ratio of forces that held and the least
-    that slipped.
+    """Determine bounds of the friction coefficient from recorded runs.
+
+    The lower bound is the largest coefficient that a hold without slip used. The upper bound is the
+    least coefficient that was used when the box slipped.
 
     Args:
+        sound: recordings without serious faults, each with its pad poses and wrenches.
         load: the estimated payload, None if unknown.
         evidence: the results, to which both bounds are added.
     """
@@ -371,6 +384,7 @@ def _tracking(sound: Sound, evidence: Evidence) -> None:
     ratio, and the delay.
 
     Args:
+        sound: recordings without serious faults, each with its pad poses and wrenches.
         evidence: the results, to which the values are added.
     """
     worst: list[float] = []
@@ -403,6 +417,7 @@ def _drift(sound: Sound, evidence: Evidence) -> None:
     """Determine the relative motion of the pads during holds, and the delay between both arms.
 
     Args:
+        sound: recordings without serious faults, each with its pad poses and wrenches.
         evidence: the results, to which the values are added.
     """
     beside: list[Array] = []

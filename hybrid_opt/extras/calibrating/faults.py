@@ -77,7 +77,7 @@ class Fault:
 
 
 def recording_faults(workcell: Workcell, run: Recording, places: Places) -> list[Fault]:
-    """Return the faults of a single run.
+    """Return the faults of a single run; empty for none.
 
     Args:
         workcell: the cell.
@@ -99,9 +99,13 @@ def recording_faults(workcell: Workcell, run: Recording, places: Places) -> list
 
 
 def _tare_faults(run: Recording, places: Places) -> list[Fault]:
-    """Return faults of labelled tares at which nothing was recorded, or an arm touches something.
+    """Return faults of the labelled tares of a run, instants at which the arms touch nothing and
+    the sensors' offsets are measured.
+
+    A tare has a fault if nothing was recorded, or if an arm touches something.
 
     Args:
+        run: the run.
         places: pad poses and wrenches of the run.
     """
     found = []
@@ -226,7 +230,11 @@ def _moment_units(workcell: Workcell, places: Places, held: Array) -> list[str]:
 
 def _dropouts(run: Recording) -> list[Fault]:
     """Return faults of intervals without new samples, and of labelled holds that the recording does
-    not contain."""
+    not contain; empty for none.
+
+    Args:
+        run: the run.
+    """
     found = [
         f"nothing new for {end - begin:.2f} s from {begin:.2f} s on" for begin, end in run.lost
     ]
@@ -257,9 +265,11 @@ def _range_faults(run: Recording) -> list[Fault]:
 
 def _pad_faults(workcell: Workcell, run: Recording, places: Places) -> list[Fault]:
     """Return faults of pads that are not at their places on the box during holds, and of normal
-    forces that vanish.
+    forces that vanish; empty for none.
 
     Args:
+        workcell: the cell.
+        run: the run.
         places: pad poses and wrenches of the run.
     """
     found = []
@@ -325,10 +335,10 @@ def _clock_faults(run: Recording, places: Places) -> list[Fault]:
 
 def load_faults(holds: list[MeasuredHold], load: Load, moments: bool) -> list[Fault]:
     """Return the faults that the balance of forces in all holds shows: wrong units, swapped arms,
-    or an unknown cause.
+    or an unknown cause. The list is empty for none.
 
     Args:
-        holds: the still pieces.
+        holds: measurements of the box held still.
         load: the load estimated from all of them.
         moments: True if the sensors measure moments.
     """

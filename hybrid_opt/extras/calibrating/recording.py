@@ -99,7 +99,10 @@ class Recording:
         return bool(np.isfinite(self.wrench[:, :, 3:]).all())
 
     def within(self, begin: float, end: float) -> Array:
-        """Find the samples between two instants [s].
+        """Find the samples between two instants.
+
+        Args:
+            begin, end: the instants, on the clock of the recording [s].
 
         Returns:
             (n,) True for these samples.
@@ -107,7 +110,11 @@ class Recording:
         return np.asarray((self.time >= begin) & (self.time <= end))
 
     def around(self, instant: float) -> Array:
-        """Find the samples at most `TARE_TIME` from an instant [s] at which both arms stand still.
+        """Find the samples at most half of `TARE_TIME` from an instant at which both arms stand
+        still.
+
+        Args:
+            instant: the instant, on the clock of the recording [s].
 
         Returns:
             (n,) True for these samples.
@@ -211,6 +218,10 @@ def together(
 def read_run(path: Path, workcell: Workcell) -> Recording:
     """Read a recorded run and its side file, which has the same name with the suffix `.toml`.
 
+    Args:
+        path: path of the recording.
+        workcell: the cell.
+
     Raises:
         ResultsError: the recording cannot be read, or lacks a column.
         WorkcellError: the side file is wrong; the message lists all problems.
@@ -244,7 +255,17 @@ def read_run(path: Path, workcell: Workcell) -> Recording:
 
 
 def _read_arm(table: TableReader, path: Path, workcell: Workcell, arm: int) -> ArmLog:
-    """Read one arm's recording, by the columns that the side file names."""
+    """Read one arm's recording, from the columns or topics that the side file names.
+
+    Args:
+        table: reader of the arm's table in the side file.
+        path: path of the recording, unless the table names another file.
+        workcell: the cell.
+        arm: index of the arm.
+
+    Raises:
+        ResultsError: the recording cannot be read, or lacks a column.
+    """
     file = path.parent / table.text("file") if table.has("file") else path
     names = list(arm_model(workcell.robots[arm]).names)[1:]
     if is_bag(file):
@@ -286,8 +307,16 @@ def _read_arm(table: TableReader, path: Path, workcell: Workcell, arm: int) -> A
 
 
 def _read_bag(table: TableReader, file: Path, names: list[str]) -> ArmLog:
-    """Read one arm's recording from ROS 2, at the times of its joint states. `names` are the names
-    of the joints."""
+    """Read one arm's recording from a ROS 2 bag, at the times of its joint states.
+
+    Args:
+        table: reader of the arm's table in the side file.
+        file: path of the bag.
+        names: names of the arm's joints, unless the table states others.
+
+    Raises:
+        ResultsError: the bag cannot be read, or has too few samples.
+    """
     if table.has("joints"):
         value = table.raw("joints")
         if not isinstance(value, list) or len(value) != len(names):
@@ -319,8 +348,18 @@ def _read_bag(table: TableReader, file: Path, names: list[str]) -> ArmLog:
 
 
 def _csv_columns(path: Path) -> dict[str, Array]:
-    """Read the columns of a CSV file by name, separated by commas, semicolons or blanks; empty
-    cells become NaN."""
+    """Read the columns of a CSV file separated by commas, semicolons or blanks. Empty cells become
+    NaN.
+
+    Args:
+        path: path of the file.
+
+    Returns:
+        Values (n,) of each column by its name.
+
+    Raises:
+        ResultsError: the file is no table of numbers below a line of names.
+    """
     try:
         text = safe_io.text(read_bytes(path))
         dialect = csv.Sniffer().sniff(text.partition("\n")[0], ",; \t")
@@ -359,7 +398,12 @@ class Places:
 
 
 def places_of(workcell: Workcell, run: Recording) -> Places:
-    """Compute pad poses, box poses and wrenches about the pads from a recorded run."""
+    """Compute pad poses, box poses and wrenches about the pads from a recorded run.
+
+    Args:
+        workcell: the cell.
+        run: the run.
+    """
     pads, boxes, wrenches = [], [], []
     for i, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
         T_world_pad = pad_places(workcell, i, run.joints[i])
@@ -385,8 +429,8 @@ def places_of(workcell: Workcell, run: Recording) -> Places:
 
 
 def tared(run: Recording, places: Places) -> tuple[Places, Array]:
-    """Subtract the sensors' offsets from the wrenches of a run. The offset of a sample is the one
-    measured at the last tare before it.
+    """Subtract the sensors' offsets from the wrenches of a run. The offset of a sample is the
+    offset measured at the last tare before the sample.
 
     Args:
         run: the run, whose labels state the tares.
@@ -416,10 +460,14 @@ def is_bag(path: Path) -> bool:
 
 
 def read_topics(path: Path, topics: Collection[str]) -> dict[str, Messages]:
-    """Read the messages of some topics of a ROS 2 recording, by topic.
+    """Read the messages of some topics of a ROS 2 recording.
 
     Args:
+        path: path of the recording.
         topics: names of the topics.
+
+    Returns:
+        For each topic its messages, each with its time from the beginning of the recording [s].
 
     Raises:
         ResultsError: the recording cannot be read or lacks a topic, or rosbags is not installed.
@@ -482,8 +530,11 @@ def joint_series(messages: Messages, names: list[str], path: Path) -> tuple[Arra
 def wrench_series(messages: Messages) -> tuple[Array, Array]:
     """Read forces and moments from WrenchStamped or Wrench messages.
 
+    Args:
+        messages: the messages with their times [s].
+
     Returns:
-        Times (n,) [s] and wrenches (n, 6) [N, N m].
+        Times (n,) [s] and wrenches (n, 6), force then moment [N, N m].
     """
     rows = []
     for _, message in messages:
@@ -494,8 +545,11 @@ def wrench_series(messages: Messages) -> tuple[Array, Array]:
 
 
 def force_series(messages: Messages) -> tuple[Array, Array]:
-    """Read normal forces from messages with one number each, or from wrenches, of which the
-    absolute force along z is taken.
+    """Read normal forces from messages that hold one number each, or from wrenches by the absolute
+    force along z.
+
+    Args:
+        messages: the messages with their times [s].
 
     Returns:
         Times (n,) [s] and forces (n,) [N].

@@ -93,7 +93,7 @@ class PressedBox(HeldBox):
         """Find the box, the pads and the contact points of each pad in a model.
 
         Args:
-            mujoco: the imported module.
+            mujoco: MuJoCo's Python module.
             model, data: MuJoCo's model of the cell, from `cell_text`, and its state.
             workcell: the cell.
         """
@@ -217,13 +217,13 @@ class CellSimulation:
                 payload, friction and the positions of the pads.
             control: 'impedance' for two position-controlled arms, 'leader' if only the arm that
                 does not lead controls its normal force, 'both' if both arms do.
-            factor: factor of the commanded normal forces.
+            factor: number by which the commanded normal forces are multiplied.
         """
         return _ArmSimulation(self, reference, control, factor).outcome()
 
 
 class _ArmSimulation:
-    """One simulation of a cell in progress."""
+    """State of one simulation of a whole cell while it runs."""
 
     def __init__(
         self,
@@ -341,7 +341,11 @@ class _ArmSimulation:
         return standing
 
     def _begin_step(self, time: float) -> None:
-        """Make the first half of a step: compute poses and contacts at this time."""
+        """Make the first half of a step of the physics: compute poses and contacts.
+
+        Args:
+            time: time of the step [s].
+        """
         if time < self._reference.job.stands:
             self._data.qpos[self._pose] = self._standing
             self._data.qvel[self._box_v] = 0.0
@@ -398,8 +402,16 @@ class _ArmSimulation:
 
 @dataclass(frozen=True, eq=False)
 class _Ticks:
-    """References of both arms at the times of the controllers, with attributes as in `Reference`.
-    Normal forces, and their part of the torques, are multiplied by the factor of the simulation."""
+    """References of both arms at the n times of the controllers. Normal forces are already
+    multiplied by the factor of the simulation.
+
+    Attributes:
+        time: (n,) times [s].
+        q, q_rate: (n, all joints) joint positions and velocities [rad or m, and s].
+        effort: (n, all joints) feedforward joint torques, those of the normal forces included [N m,
+            for sliding joints N].
+        normal_force: (n, 2) commanded normal force of each arm [N].
+    """
 
     time: Array
     q: Array

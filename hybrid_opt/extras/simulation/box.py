@@ -56,7 +56,7 @@ class Outcome:
     """Outcome of one simulation, with measurements at n times.
 
     Attributes:
-        factor: factor of the pressing force.
+        factor: number by which the pressing force was multiplied.
         holds: True if the box slipped by less than the `slip` of the settings.
         time: (n,) times of the measurements [s], the first when the pads are pressed and the box is
             at rest.
@@ -77,8 +77,8 @@ class Outcome:
         return int(self.slip[-1].argmax())
 
     def begins(self, slip: float) -> float:
-        """Return the time at which the largest slip first exceeds `BEGINS` times `slip` [s];
-        infinite if it never does.
+        """Return the time at which the box begins to slip [s]: its largest displacement first
+        exceeds `BEGINS` times `slip`. Infinite if it never does.
 
         Args:
             slip: displacement that counts as slip [m].
@@ -95,7 +95,8 @@ class Threshold(Generic[AnyOutcome]):
     """The least factor of a force that holds the box, bracketed by two simulations.
 
     Attributes:
-        slips, holds: outcome of the simulation just below the threshold, and of the one just above.
+        slips: outcome of the simulation with a factor just below, in which the box slips.
+        holds: outcome of the simulation with a factor just above, in which the box holds.
     """
 
     slips: AnyOutcome
@@ -157,7 +158,12 @@ class HeldBox:
     """
 
     def __init__(self, model: Any, data: Any, workcell: Workcell) -> None:
-        """Find pads and box in a model of `hybrid_opt.extras.simulation.scene`."""
+        """Find pads and box in a model of `hybrid_opt.extras.simulation.scene`.
+
+        Args:
+            model, data: MuJoCo's model and its state.
+            workcell: the cell.
+        """
         self.sites = [int(model.site(f"pad_{i + 1}").id) for i in (0, 1)]
         self.box = int(model.body("box").id)
         self._data = data
@@ -253,6 +259,10 @@ def planned_moments(cell: Cell, carry: Carry) -> Array:
     """Compute the moment of each robot's planned wrench about the middle of its pads, world frame:
     at rest before the carry, then at its n samples.
 
+    Args:
+        cell: the cell.
+        carry: the carry at n samples.
+
     Returns:
         (n + 1, 2, 3) moments [N m].
     """
@@ -324,7 +334,11 @@ def drive_of(
 
 def carriage_motion(carry: Carry, settings: SimulationSettings) -> CarriageMotion:
     """Compute the motion of the pads for the simulation of a carry. The box is at rest for some
-    time before it.
+    time before the carry.
+
+    Args:
+        carry: the carry.
+        settings: settings of the simulation, with the time at rest.
 
     Raises:
         SettingsError: the carry does not start and end at rest.
@@ -356,6 +370,9 @@ def carriage_motion(carry: Carry, settings: SimulationSettings) -> CarriageMotio
 
 def refuse_motion_at_ends(carry: Carry) -> None:
     """Check that a carry starts and ends at rest, as simulations need.
+
+    Args:
+        carry: the carry.
 
     Raises:
         SettingsError: the carry does not start and end at rest.
@@ -403,7 +420,7 @@ class BoxSimulation:
 
         Args:
             drive: motion of the pads and pressing force.
-            factor: factor of the pressing force.
+            factor: number by which the pressing force is multiplied.
         """
         mujoco, model, settings = self._mujoco, self._model(drive.leader), self.settings
         data = mujoco.MjData(model)
@@ -447,6 +464,7 @@ def workcell_of_case(workcell: Workcell, case: Array) -> Workcell:
     disturbance and the arms' errors in a case have no place in a workcell and are left out.
 
     Args:
+        workcell: the cell.
         case: (18,) values in the order of `symbolic.contact.worst_cases.CASE_SIZES`.
     """
     payload = workcell.payload

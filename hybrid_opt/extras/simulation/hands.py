@@ -152,7 +152,7 @@ class HandSimulation:
         Args:
             motion: motion of the carriage, which bears all hands.
             holding_force: holding force of each hand, or (2,) that of each robot's hands [N].
-            factor: factor of the holding force.
+            factor: number by which the holding forces are multiplied.
         """
         mujoco, settings = self._mujoco, self.settings
         model = copy(self._model())
@@ -235,6 +235,10 @@ def hand_threshold(
     """Find the least factor of a carry's planned forces with which no hand slips and the payload
     stays on the rims of all hands.
 
+    Args:
+        carry: the carry.
+        settings: settings of the simulation.
+
     Raises:
         SimulationError: MuJoCo is not installed, the payload slips or lifts at `HIGH_FACTOR`, or it
             holds at `LOW_FACTOR`.
@@ -254,7 +258,12 @@ class HeldInHands:
     """
 
     def __init__(self, model: Any, data: Any, workcell: Workcell) -> None:
-        """Find hands and payload in a model."""
+        """Find hands and payload in a model of the scene.
+
+        Args:
+            model, data: MuJoCo's model and its state.
+            workcell: the cell.
+        """
         self.each, self._robots = range(len(workcell.pads)), np.array(workcell.pad_robots)
         self._bodies = [int(model.body(f"hand_{k}").id) for k in self.each]
         self._box, self._carriage = (int(model.body(name).id) for name in ("box", "carriage"))
@@ -293,7 +302,12 @@ class HeldInHands:
 
 def swing_frequency(workcell: Workcell, settings: SimulationSettings = HAND_SETTINGS) -> float:
     """Compute the lowest frequency at which the payload swings on the elastic layers of its hands
-    while the arms are at rest [Hz]."""
+    while the arms are at rest [Hz].
+
+    Args:
+        workcell: the cell.
+        settings: settings of the simulation, with the stiffness of the layers.
+    """
     payload, stiffness = workcell.payload, _stiffness(workcell.pads, settings.layer)
     # Velocities of the centre of mass from those of the box frame.
     to_centre = np.eye(6)
@@ -320,6 +334,7 @@ def _displacement(workcell: Workcell, layer: float, opposed: ArrayLike) -> Array
     against each other with a given force.
 
     Args:
+        workcell: the cell.
         layer: stiffness of the hands' elastic layers per area [N/m^3].
         opposed: (3,) the force on the payload, box frame [N].
 
@@ -361,13 +376,23 @@ def lip_points(hand: Contact, points: int) -> Array:
 
 
 def _normal_stiffness(hand: Contact, settings: SimulationSettings) -> float:
-    """Return the stiffness of a hand's elastic layer along the normal, per area [N/m^3]."""
+    """Return the stiffness of a hand's elastic layer along the normal, per area [N/m^3].
+
+    Args:
+        hand: the hand.
+        settings: settings of the simulation, with the stiffness of a usual layer.
+    """
     return settings.layer * hand.layer_stiffness
 
 
 def _along(hand: Contact, settings: SimulationSettings) -> tuple[float, float]:
     """Return the stiffness of a hand's elastic layer against displacement along the patch [N/m],
-    and against rotation about the normal [N m/rad]."""
+    and against rotation about the normal [N m/rad].
+
+    Args:
+        hand: the hand.
+        settings: settings of the simulation.
+    """
     points = lip_points(hand, settings.points)
     shear = hand.layer_shear * _normal_stiffness(hand, settings) * hand.area
     return shear, shear * float((points**2).sum(axis=1).mean())
@@ -397,6 +422,8 @@ def _hand_text(hand: Contact, settings: SimulationSettings, k: int, borne: float
     """Return a hand as MJCF, a body of the carriage.
 
     Args:
+        hand: the hand.
+        settings: settings of the simulation.
         k: index of the hand, for names.
         borne: part of the payload's mass that the hand bears [kg].
     """

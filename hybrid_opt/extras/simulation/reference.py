@@ -234,7 +234,7 @@ def with_tracking_error(
 
 
 def press_torque(workcell: Workcell, q: Array) -> Array:
-    """Compute the joint torques per newton of normal force of each arm.
+    """Compute the joint torques that exert a normal force of one newton with each arm.
 
     Both arms press along their normals if these are opposite, else along the line between the
     middles of their pads. So the additional forces cancel in the payload.
@@ -288,8 +288,15 @@ def _force_torque(workcell: Workcell, q: Array, forces: tuple[Array, Array]) -> 
 
 
 def inverse_dynamics(workcell: Workcell, motion: JointMotion) -> Array:
-    """Compute the joint torques (n, all joints) that move both arms without contacts, gravity
-    included [N m, for sliding joints N]."""
+    """Compute the joint torques that move both arms without contacts, gravity included.
+
+    Args:
+        workcell: the cell.
+        motion: motion of the joints at n times.
+
+    Returns:
+        (n, all joints) torques [N m, for sliding joints N].
+    """
     found = []
     parts = [joints_of(workcell, values) for values in (motion.q, motion.q_rate, motion.q_second)]
     for robot, *rows in zip(workcell.robots, *parts, strict=True):
@@ -304,8 +311,13 @@ def _counts(workcell: Workcell) -> list[int]:
 
 
 def _with_rest(values: Array, keep: float) -> Array:
-    """Prepend two rows of rest to an array (n, ...): copies of its first row, multiplied by
-    `keep`."""
+    """Prepend two rows for a time at rest to an array (n, ...). Both are copies of the first row
+    multiplied by a factor.
+
+    Args:
+        values: (n, ...) the array.
+        keep: the factor: 1 for positions, 0 for rates.
+    """
     return np.concatenate([keep * values[:1], keep * values[:1], values])
 
 
@@ -391,22 +403,30 @@ class ArmController:
 
 
 def pressed_reference(cell: Cell, carry: Carry, leader: int = 0) -> tuple[Reference, Squeeze]:
-    """Build the commands to both arms for a carry with the commanded normal forces of a job. Return
-    them, and how these forces were chosen.
+    """Build the commands to both arms for a carry with the commanded normal forces of a job.
 
     The forces hold the box in every case of the uncertainty, if the workcell states one. They are
     smooth, so controllers can follow them, and never below the required forces.
 
     Args:
+        cell: the cell.
+        carry: carry from rest to rest.
         leader: index of the arm that keeps its place; the other one is force-controlled.
+
+    Returns:
+        The commands, and how the forces were chosen.
     """
     forces, squeeze = commanded_forces(cell.workcell, carry, SqueezeSettings(leader=leader))
     return carry_reference(cell, carry, forces[:, 1 - leader], leader), squeeze
 
 
 def driven_carry(cell: Cell, x: Array) -> Carry:
-    """Compute the carry of a decision vector x (n_var,), timed as in a job from rest to rest
-    without jumps of acceleration.
+    """Compute the carry of a decision vector, timed as in a job from rest to rest without jumps of
+    acceleration.
+
+    Args:
+        cell: the cell.
+        x: (n_var,) decision vector.
 
     Raises:
         SimulationError: the path has no timing.
@@ -417,6 +437,10 @@ def driven_carry(cell: Cell, x: Array) -> Carry:
 
 def exported_carry(cell: Cell, timing: Timing) -> Carry:
     """Compute the carry of a timing as a job drives it, without jumps of acceleration.
+
+    Args:
+        cell: the cell.
+        timing: timing of a path of the cell.
 
     Raises:
         SimulationError: the timing has no carry.

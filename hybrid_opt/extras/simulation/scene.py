@@ -294,6 +294,7 @@ def contact_points(
 
     Args:
         contact: contact of the robot.
+        settings: settings of the contacts.
         T_body_pad: (4, 4) pose of the first pad in the frame of the body.
         pads: kind of pads, as in `SimulationSettings`.
     """
@@ -326,7 +327,7 @@ def point_geoms(pad: Contact, layer: float, points: Array, T_body_pad: Array) ->
 
 
 def patch_area(contact: Contact) -> float:
-    """Compute the area of all pads of a robot [m^2]."""
+    """Compute the area of all pads of a robot's contact [m^2]."""
     return sum(pad.area for pad in (contact, *contact.further))
 
 
@@ -357,8 +358,9 @@ def pressed_places(contact: Contact, pads: Pads, points: int) -> Array:
 
 
 def tilt_centre(contact: Contact) -> Array:
-    """Compute the middle of a robot's pads (3,) in the frame of its first pad [m]. All pads share a
-    normal force evenly that acts there."""
+    """Compute the middle of a robot's pads (3,) in the frame of its first pad [m]. A normal force
+    that acts there is shared evenly by all pads.
+    """
     places = np.mean([pad.T_box_pad[:3, 3] for pad in (contact, *contact.further)], axis=0)
     T = contact.T_box_pad
     return np.asarray(T[:3, :3].T @ (places - T[:3, 3]))
@@ -383,7 +385,7 @@ def rim(contact: Contact, points: int) -> Array:
 
 
 def presses_on_box(workcell: Workcell) -> bool:
-    """Return True if all pads press on faces of a box."""
+    """Return True if the cell's payload is a box and all pads press on its faces."""
     size = workcell.payload.size
     return workcell.payload.shape is None and all(
         abs(pad.T_box_pad[:3, 2] @ (pad.T_box_pad[:3, 3] + pad.T_box_pad[:3, 2] * size / 2.0))
@@ -487,9 +489,13 @@ def mjcf_text(values: ArrayLike) -> str:
 def cell_text(workcell: Workcell, settings: ArmSettings) -> str:
     """Return the MJCF document of a whole cell, for `compiled`.
 
-    Joints are named `joint_ROBOT_NUMBER`, sites of the pads `pad_1` and `pad_2`, the box `box`. A
-    joint that moves both arms, and its link, occur in both arms and are tied together. The effort
-    of either arm contains the whole weight of the link.
+    Joints in the document are named `joint_ROBOT_NUMBER`, sites of the pads `pad_1` and `pad_2`,
+    the box `box`. A joint that moves both arms, and its link, occur in both arms and are tied
+    together. The effort of either arm contains the whole weight of the link.
+
+    Args:
+        workcell: the cell.
+        settings: settings of the simulation.
     """
     meshes: list[str] = []
     shown: dict[Frame, list[str]] = {}
@@ -529,8 +535,9 @@ def cell_text(workcell: Workcell, settings: ArmSettings) -> str:
 
 
 def _ties(workcell: Workcell) -> Iterator[str]:
-    """Yield MJCF constraints that keep the two copies of each joint that moves both arms equal, as
-    stiff as the time step allows."""
+    """Yield MJCF constraints, as stiff as the time step allows, that keep both copies of a joint
+    equal, for each joint that moves both arms of the cell.
+    """
     names = [tuple(arm_model(robot).names)[1:] for robot in workcell.robots]
     for name in common_joints(workcell.robots):
         first, second = (_name("joint", i, own.index(name)) for i, own in enumerate(names))
@@ -541,8 +548,10 @@ def _arm(workcell: Workcell, settings: ArmSettings, i: int, shown: dict[Frame, l
     """Return the nested bodies of one arm as MJCF. The last one bears its pads.
 
     Args:
+        workcell: the cell.
+        settings: settings of the simulation.
         i: index of the arm.
-        shown: MJCF geoms by frame.
+        shown: MJCF geoms of the bodies that are only shown, by frame.
     """
     model, geometry = arm_model(workcell.robots[i]), arm_geometry(workcell, i)
     contact = workcell.contacts[i]
@@ -569,7 +578,7 @@ def _name(kind: str, robot: int, joint: int) -> str:
 
 
 def joint_names(workcell: Workcell) -> list[str]:
-    """Return the names of both arms' joints in the document, first those of arm 1."""
+    """Return the names of both arms' joints in the MJCF document, first those of arm 1."""
     counts = [len(robot.torque_max) for robot in workcell.robots]
     return [_name("joint", i, j) for i, count in enumerate(counts) for j in range(count)]
 
