@@ -189,7 +189,8 @@ class Distances:
         that is the least distance, because no distance is below its bound.
 
         Args:
-            stretches: slice of places and index of the pair, for each stretch.
+            stretches: for each stretch, the slice of its successive places and the index of the
+                pair.
             below: only distances with lower bounds below this are measured [m].
         """
         open_, found = list(range(len(stretches))), [np.inf] * len(stretches)
@@ -240,7 +241,11 @@ class CarryReader:
         )
 
     def read(self, x: Array) -> PlacedCarry:
-        """Evaluate a decision vector x (n_var,) at all places of the path."""
+        """Evaluate a candidate at all places of the path.
+
+        Args:
+            x: (n_var,) decision vector.
+        """
         cell, evaluator, grid = self._cell, self._cell.evaluator, self._cell.grid
         found = {name: value[0] for name, value in evaluator.outputs(x[None]).items()}
         waypoints = cell.waypoints(x)

@@ -126,11 +126,15 @@ class PolishFunctions:
 
 
 def sample_quantities(workcell: Workcell) -> tuple[Quantity, ...]:
-    """Return the names of the quantities that the polish of a cell evaluates at samples.
+    """Return the names of the quantities that the polish of a cell evaluates at samples: 'force',
+    'pressure' or 'load'.
 
-    For drivable cells there are none, because their limits apply at the intervals of the timing.
-    For pads whose forces have no closed form, the quantity is the load, from which a convex program
-    computes the forces.
+    Drivable cells have none, because their limits apply at the intervals of the timing. Pads whose
+    forces have no closed form have 'load': the force and moment that the box needs. A convex
+    program computes the forces from it.
+
+    Args:
+        workcell: the cell.
     """
     if workcell.task.law.is_drivable:
         return ()
@@ -197,14 +201,21 @@ def _held(model: CellModel) -> dict[str, ca.Function]:
 
 
 def _driven_held(model: CellModel) -> dict[str, ca.Function]:
-    """Return the functions of grasp forces with the barrier weight of the timing's own grasp
-    program, so that polish and timing compute equal forces."""
+    """Return the functions of grasp forces, by name, with the barrier weight that the timing uses.
+    So polish and timing compute equal forces.
+
+    Args:
+        model: arms and bodies of the cell.
+    """
     return grasp_force_functions(model.workcell, TIMING_BARRIER_WEIGHT)
 
 
 def _names(quantities: tuple[Quantity, ...]) -> set[str]:
-    """Return the names of all functions that `polish_functions` builds for quantities at
-    samples."""
+    """Return the names of all functions that `polish_functions` builds.
+
+    Args:
+        quantities: names of the quantities that are evaluated at samples.
+    """
     blocks = ("inner", "first", "last", "path")
     return {
         GAPS,
@@ -236,21 +247,34 @@ class Grid:
         self.basis, self.rate_basis = along.position, along.first
 
     def places(self, width: float) -> int:
-        """Convert a width in the path parameter to a number of places, at least one."""
+        """Convert a width in the path parameter to a number of intervals between places, at least
+        one.
+        """
         return max(1, round(width * (len(self.parameter) - 1)))
 
     def samples(self, width: float) -> int:
-        """Convert a width in the path parameter to a number of samples, at least one."""
+        """Convert a width in the path parameter to a number of intervals between samples, at least
+        one.
+        """
         return max(1, round(width * (len(self.sample_parameter) - 1)))
 
     def between(self, values: Array) -> Array:
-        """Interpolate values (n, k) at the n samples linearly to all m places; return (m, k)."""
+        """Interpolate values at the n samples linearly to all m places.
+
+        Args:
+            values: (n, k) k values at each sample.
+
+        Returns:
+            (m, k) values at the places.
+        """
         return np.column_stack(
             [np.interp(self.parameter, self.sample_parameter, column) for column in values.T]
         )
 
     def movable(self, place: int) -> bool:
-        """Return False for the first and the last place of the path, which are fixed, else True."""
+        """Return True if a place, given by its index, is neither the first nor the last of the
+        path, which are fixed.
+        """
         return 0 < place < len(self.parameter) - 1
 
 
@@ -312,8 +336,12 @@ class SmoothCell:
         return self.centre + self.half * xi
 
     def step(self, start: Array, end: Array) -> float:
-        """Return the largest change of any scaled variable between two decision vectors
-        (n_var,)."""
+        """Return the largest change of any scaled variable between two decision vectors.
+
+        Args:
+            start: (n_var,) decision vector.
+            end: (n_var,) another decision vector.
+        """
         return float(np.max(np.abs(end - start) / self.half))
 
     def waypoints(self, x: Array) -> Array:

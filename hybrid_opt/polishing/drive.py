@@ -114,8 +114,8 @@ def is_polishable(workcell: Workcell, robust: bool) -> bool:
 def force_range(driver: CandidateDriver) -> tuple[float, float]:
     """Return the least and the largest force limit of the task [N].
 
-    If the limit applies to robust forces, the least one is at least what holds the box at rest at
-    both ends of the path.
+    If the limit applies to robust forces, the least limit at least suffices to hold the box at rest
+    at both ends of the path.
     """
     workcell = driver.timer.workcell
     least, most = workcell.task.force_limit
@@ -162,7 +162,12 @@ class DriveStep(Step):
 
 @dataclass(frozen=True)
 class _StepAnswer:
-    """Solution of a quadratic program, and the program's rows."""
+    """Solution of a quadratic program, and the program's rows.
+
+    Attributes:
+        answer: the solution.
+        linear: linearised rows (scalar inequalities) of the program.
+    """
 
     answer: QuadraticAnswer
     linear: LinearisedRows
@@ -222,7 +227,11 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
             self.coarse = DriveStepMethod(cell, is_coarse=True)
 
     def evaluate(self, x: Array) -> DriveIterate:
-        """Evaluate a decision vector (n_var,) with its fastest timing."""
+        """Evaluate a decision vector with its fastest timing.
+
+        Args:
+            x: (n_var,) decision vector.
+        """
         timed = self.driver.time_candidate(x)
         return self._iterate(x, timed, timed.squared, np.inf)
 
@@ -235,7 +244,12 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         )
 
     def _moved(self, x: Array, d: Array) -> Array:
-        """Return the decision vector (n_var,) after a step d (n_path,) of the path variables."""
+        """Return the decision vector (n_var,) after a step, clipped to the bounds.
+
+        Args:
+            x: (n_var,) decision vector before the step.
+            d: (n_path,) change of the program's path variables.
+        """
         n, task = self._n, self.cell.task
         moved = x[:n] + self._spread @ d
         return np.append(np.clip(moved, task.lower[:n], task.upper[:n]), x[n:])
@@ -245,7 +259,7 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
 
         Shorter fractions of the step are tried until the duration falls by at least the share
         `LEAST_REDUCTION_RATIO` of the prediction. If the prediction is smaller than the timing's
-        rounding, a step is accepted without a gain too, as long as such losses do not accumulate.
+        rounding, a step without a gain is also accepted, as long as such losses do not accumulate.
 
         Args:
             best: the best iterate so far, from which the step starts.
@@ -302,7 +316,8 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
 
         Args:
             best: the best iterate so far.
-            required: value that each geometric row has to exceed.
+            required: value that each geometric row (scalar inequality at a place of the path) has
+                to exceed.
             radius: half the width of the trust region [half ranges of the variables].
 
         Returns:
@@ -366,14 +381,16 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         """Solve a quadratic model, and solve it again with the timing rows that the solution
         violates.
 
-        These rows are added to `chosen` in place.
+        A timing row is one limit at one point of the timing. Violated rows are added to `chosen` in
+        place.
 
         Args:
             program: program of path and timing.
             chosen: (points, kinds) mask of the timing rows in the model.
             model: Hessian, and vector that is added to the objective's gradient.
             box: lower and upper bounds (n,) of the step.
-            bent: (geometric rows,) nonlinearity along an earlier step, added to the geometric rows.
+            bent: (geometric rows,) error of the rows' linear model along an earlier step, added to
+                the geometric rows.
 
         Returns:
             The last solution with its rows; None if there is no solution.
@@ -413,7 +430,12 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
     ) -> Residuals:
         """Compute the optimality residuals of an iterate with the multipliers of a step.
 
-        The variables' own bounds count as constraints, those of the trust region do not.
+        The variables' own bounds count as constraints; those of the trust region do not.
+
+        Args:
+            program: program of path and timing about the iterate.
+            best: the iterate.
+            found: solution that contains the step and its multipliers.
         """
         (lower, upper), n, answer = self._bounds, program.n_path, found.answer
         edge, own = 1e-6 * self._unit, answer.bounds[:n]

@@ -104,7 +104,7 @@ def recheck_timing(driver: CandidateDriver, model: TimingModel, x: Array) -> str
 
 
 class DriveRun(PolishRun[DriveAttempt]):
-    """The polish of one front of drivable carries, in progress."""
+    """State of the polish of one front of drivable carries while it runs."""
 
     def __init__(
         self,
@@ -198,8 +198,9 @@ class DriveRun(PolishRun[DriveAttempt]):
     def _rotated(self, force: float) -> list[Array]:
         """Return paths (n_path,) in which the box is rotated at the waypoints of the workcell file.
 
-        The fastest known path and the hand-made one are rotated, in every direction. If pads choose
-        their pressure, tilting is free within the patches and decides in which basin a solve ends.
+        The fastest known path and the hand-made one are rotated, in every direction. For pads whose
+        pressure may shift within the patches, the tilt of the box decides in which basin a solve
+        ends.
 
         Args:
             force: force limit [N] at which the rotated paths need a timing.
@@ -227,10 +228,14 @@ class DriveRun(PolishRun[DriveAttempt]):
         return min(float(self._archive.x[index][-1]), share * self._reference)
 
     def _intermediate_force(self, first: float, second: float) -> float:
-        """Return a force limit [N] between the force limits `first` and `second` [N].
+        """Return a force limit [N] between two others.
 
         Its excess over the force at rest is the geometric mean of their excesses, because durations
         depend on the square root of the excess.
+
+        Args:
+            first: a force limit [N].
+            second: another force limit [N].
         """
         above = np.sqrt((first - self._still) * (second - self._still))
         return float(self._still + above)
@@ -291,11 +296,15 @@ class DriveRun(PolishRun[DriveAttempt]):
         return np.asarray(paths[np.unique(np.argmin(durations, axis=1))])
 
     def _limits(self, least: float, fast: float, count: int) -> list[float]:
-        """Return increasing force limits [N] whose excess over the force at rest grows
-        geometrically.
+        """Return increasing force limits [N] for the sweep.
 
-        `count` limits lie from `least` to `fast`; further ones in this ratio follow up to the
-        largest limit of the front. The excess decides the duration.
+        Their excess over the force at rest, which decides the duration, grows geometrically. After
+        `fast` limits continue in this ratio up to the largest limit of the front.
+
+        Args:
+            least: first limit [N].
+            fast: last limit of the first part [N].
+            count: number of limits from `least` to `fast`.
         """
         low, high, most = np.array([least, fast, self._largest]) - self._still
         step = np.log(high / low) / max(count - 1, 1)
@@ -306,8 +315,11 @@ class DriveRun(PolishRun[DriveAttempt]):
         return sorted(set(limits))
 
     def _known_paths(self, force: float) -> tuple[Array, Array]:
-        """Return all known paths (n, n_path), and their durations (n,) [s] within a force limit
-        [N]."""
+        """Return all known paths (n, n_path), and their durations (n,) [s] within a force limit.
+
+        Args:
+            force: the force limit [N].
+        """
         known = [self._archive.x[k][: self._n_path] for k in self._archive.front_indices()]
         paths = np.unique(np.vstack([*known, self._others]), axis=0)
         return paths, self._driver.durations(paths, force)

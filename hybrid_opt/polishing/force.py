@@ -101,19 +101,28 @@ class Scalarisation:
 
     @property
     def limits(self) -> MinimisedForces:
-        """For each robot, True if its peak force is bounded by the level; the other only breaks
-        ties."""
+        """For each robot, True if its peak force is minimised by way of the level a; False if it
+        only decides between equal levels.
+        """
         first, second = (self.offset < UNBOUNDED_OFFSET).tolist()
         return first, second
 
     def least_level(self, phi: Array) -> float:
-        """Return the least level a that scaled peak forces phi (2,) allow."""
+        """Return the least level a that scaled peak forces allow.
+
+        Args:
+            phi: (2,) scaled peak force of each robot.
+        """
         ahead = self.direction > 0.0
         return float(np.max((phi - self.offset)[ahead] / self.direction[ahead]))
 
     def level(self, peak: Array) -> float:
-        """Return cost . (a, phi_1, phi_2) for peak forces over the reference forces (2,), with the
-        least level a."""
+        """Return the objective cost . (a, phi_1, phi_2) of peak forces, with the least level a that
+        they allow.
+
+        Args:
+            peak: (2,) peak force of each robot over its reference force.
+        """
         phi = (peak - self.anchor) / self.span
         return float(self.cost @ np.concatenate([[self.least_level(phi)], phi]))
 
@@ -134,7 +143,8 @@ def pascoletti_serafini(anchor: Array, span: Array) -> Scalarisation:
 
 
 def extreme_scalarisation(anchor: Array, span: Array, objective: int) -> Scalarisation:
-    """Return the scalarisation that minimises one peak force; the other one only breaks ties.
+    """Return the scalarisation that minimises one peak force; the other one only decides between
+    equal results.
 
     Args:
         anchor: (2,) origin of the scaled peak forces.
@@ -151,8 +161,8 @@ def balanced_scalarisation(anchor: Array, span: Array) -> Scalarisation:
     """Return the scalarisation sum_j phi_j + `LARGER_WEIGHT` max_j phi_j of both scaled peak forces
     phi_j.
 
-    If one robot can relieve the other at little cost, both then carry alike, which leaves most room
-    for payload.
+    With it both robots press about equally where one can relieve the other at little cost. This
+    leaves most room for payload.
 
     Args:
         anchor: (2,) peak forces over the reference forces; their mean is the common origin.
@@ -199,7 +209,8 @@ class ForceProgram:
 
         Args:
             cell: shared data of the cell's programs.
-            required: value that each row has to exceed; for force rows it is not used.
+            required: value that each row (scalar inequality) has to exceed; for force rows it is
+                not used.
             target: the scalarisation that is minimised.
             carry: the candidate, evaluated at places of the path.
             x: (n_var,) decision vector of the candidate.
@@ -260,8 +271,11 @@ class ForceProgram:
         self._jacobian: Array | None = None
 
     def values(self, z: Array) -> Array:
-        """Return the values (n_rows,) of all rows at z (n_variables,). The last result is
-        cached."""
+        """Return the values (n_rows,) of all rows (scalar inequalities). The last result is cached.
+
+        Args:
+            z: (n_variables,) variables of the program.
+        """
         key = z.tobytes()
         if key != self._known:
             self._values = self._rows.values(self._cell.unscaled(z[: self._n]), z[self._n :])
@@ -269,8 +283,12 @@ class ForceProgram:
         return self._values
 
     def rows(self, z: Array) -> tuple[Array, Array]:
-        """Return values (n_rows,) and slopes (n_rows, n_variables) of all rows at z
-        (n_variables,)."""
+        """Return values (n_rows,) and derivatives (n_rows, n_variables) of all rows (scalar
+        inequalities).
+
+        Args:
+            z: (n_variables,) variables of the program.
+        """
         values = self.values(z)
         if self._jacobian is None:
             self._jacobian = self._rows.slopes()
@@ -278,8 +296,12 @@ class ForceProgram:
         return values, self._jacobian
 
     def curvature(self, z: Array, weights: Array) -> Array:
-        """Return the Hessian (n_variables, n_variables) of weights . rows at z, for weights
-        (n_rows,)."""
+        """Return the Hessian (n_variables, n_variables) of the weighted sum of all rows.
+
+        Args:
+            z: (n_variables,) variables of the program.
+            weights: (n_rows,) weights of the rows.
+        """
         self.rows(z)
         n, half = self._n, self._cell.half
         full = np.zeros((n + 3, n + 3))
@@ -337,8 +359,11 @@ class ForceStepMethod(StepMethod[Iterate, ForceStep]):
         self._iterations, self._barrier = iterations, barrier
 
     def evaluate(self, x: Array) -> Iterate:
-        """Evaluate a decision vector x (n_var,); its level is the scalarisation of its peak
-        forces."""
+        """Evaluate a decision vector. Its level is the scalarisation of its peak forces.
+
+        Args:
+            x: (n_var,) decision vector.
+        """
         carry = self.reader.read(x)
         return Iterate(x, carry, self._target.level(carry.peak))
 
@@ -349,7 +374,7 @@ class ForceStepMethod(StepMethod[Iterate, ForceStep]):
 
         Args:
             best: the best iterate so far.
-            required: value that each row of the program has to exceed.
+            required: value that each row (scalar inequality) of the program has to exceed.
             radius: half the width of the trust region [half ranges of the variables].
 
         Returns:
@@ -370,8 +395,13 @@ class ForceStepMethod(StepMethod[Iterate, ForceStep]):
         )
 
     def evaluate_step(self, best: Iterate, step: ForceStep) -> StepEvaluation[Iterate]:
-        """Evaluate the candidate after a step, and compare its level with that of the best
-        iterate."""
+        """Evaluate the candidate after a step, and compare its level, the minimised value, with
+        that of the best iterate.
+
+        Args:
+            best: the best iterate so far.
+            step: the step.
+        """
         trial = self.evaluate(step.x)
         return StepEvaluation(trial, trial.level < best.level)
 
@@ -393,7 +423,12 @@ class ForceStepMethod(StepMethod[Iterate, ForceStep]):
         return trial if trial.level < best.level else None
 
     def missing_rows(self, trial: Iterate) -> set[Row]:
-        """Return force rows at and beside the local maxima of a candidate's minimised forces."""
+        """Return force rows (scalar inequalities) at and beside the local maxima of a candidate's
+        minimised normal forces.
+
+        Args:
+            trial: the candidate.
+        """
         return set(self.active.forces.peak_rows(trial.carry, self.limits))
 
 

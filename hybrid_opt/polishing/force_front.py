@@ -104,7 +104,7 @@ class ForceAttempt(Attempt):
 
 
 def front_attempts(archive: ParetoArchive, settings: PolishSettings) -> list[ForceAttempt]:
-    """Return attempts to improve evenly spread points of the front, the balanced one among them."""
+    """Return attempts to improve evenly spread points of a front, among them the balanced point."""
     rows = archive.front_indices()
     count = min(len(rows), ceil(settings.attempts * OWN_SHARE))
     chosen = {rows[k] for k in evenly(len(rows), count)}
@@ -177,10 +177,10 @@ def refinement_attempt(archive: ParetoArchive, objective: int | None) -> ForceAt
 
 
 def probe_attempt(start: Start, objective: int | None) -> ForceAttempt:
-    """Return a short solve from a start towards an end of the front.
+    """Return a short solve towards an end of the front.
 
     Args:
-        start: the start.
+        start: feasible candidate from which the solve starts.
         objective: index of the objective that is least at the end; None for the balanced middle.
     """
     target = scalarisation_for(start.objectives, np.full(2, LEAST_SPAN), objective)
@@ -188,9 +188,8 @@ def probe_attempt(start: Start, objective: int | None) -> ForceAttempt:
 
 
 def better_half(reached: list[Start], objective: int | None) -> list[Start]:
-    """Return the better half of the starts, the best first; none if there is only one.
-
-    Starts are compared by the objective with this index, or by the sum of both for None.
+    """Return the better half of the candidates, the best first; none if there is only one. They are
+    compared by the objective with this index, or by the sum of both objectives for None.
     """
     ranked = sorted(reached, key=lambda start: start.value(objective))
     return ranked[: len(reached) // 2]
@@ -301,16 +300,18 @@ def made_little_progress(
 
 
 def _target(archive: ParetoArchive, k: int, step: float) -> Scalarisation:
-    """Return the scalarisation that aims at a point of the front beside point `k` of the archive,
-    at a signed distance `step` along the front [front's extent]."""
+    """Return the scalarisation that aims at a point of the front at a signed distance `step`
+    [front's extent] along the front from the point with index `k` in the archive.
+    """
     span = archive.span()
     aside = np.array([0.5, -0.5]) * step * span
     return pascoletti_serafini(archive.objectives[k] + aside, span)
 
 
 def widest_untried_gap(archive: ParetoArchive, tried: Collection[Chord]) -> ForceGap | None:
-    """Return the widest gap between two polished points whose chord is not in `tried`; None if
-    there is none."""
+    """Return the widest gap between two polished points whose chord (decision vectors on both
+    sides) was not tried yet; None if there is none.
+    """
     for gap in sorted(gaps(archive), key=lambda gap: -gap.width):
         is_polished = archive.polished[gap.first] and archive.polished[gap.second]
         if is_polished and chord_across(archive, gap) not in tried:
@@ -326,7 +327,7 @@ def chord_across(archive: ParetoArchive, gap: ForceGap) -> Chord:
 def best_on_chord(
     evaluator: CandidateEvaluator, archive: ParetoArchive, gap: ForceGap
 ) -> tuple[Array, Array] | None:
-    """Evaluate points on the chord of a gap, the line between both neighbours' decision vectors.
+    """Evaluate points on the line between the decision vectors of a gap's two neighbours.
 
     Returns:
         Decision vector (n_var,) and objectives (2,) of the feasible point that dominates the
@@ -345,7 +346,7 @@ def best_on_chord(
 
 
 class ForceRun(PolishRun[ForceAttempt]):
-    """The polish of one front of both peak forces, in progress."""
+    """State of the polish of one front of both peak forces while it runs."""
 
     def __init__(
         self,
@@ -406,10 +407,9 @@ class ForceRun(PolishRun[ForceAttempt]):
             self._certify_unproven()
 
     def _probes(self, objective: int | None, rng: np.random.Generator) -> Iterator[ForceAttempt]:
-        """Yield short solves far from the front by successive halving.
-
-        They start from random feasible candidates and from the best point, then from the better
-        half of the results, until one is left.
+        """Yield short solves far from the front, by successive halving. They start from random
+        feasible candidates and from the best point for `objective` (None: the balanced middle),
+        then from the better half of the results, until one is left.
         """
         count = self._starts(objective)
         if not count:
@@ -430,8 +430,9 @@ class ForceRun(PolishRun[ForceAttempt]):
             pool = better_half(reached, objective)
 
     def _starts(self, objective: int | None) -> int:
-        """Return the number of starts of short solves towards an end or the balanced middle (None),
-        at most twice the number of remaining attempts."""
+        """Return the number of starts of short solves towards the end of the front with this
+        objective, or towards the balanced middle (None): at most twice the remaining attempts.
+        """
         probe = self._settings.probe
         count = probe.starts if self._mirror is not None else (probe.starts + 1) // 2
         return min(2 * self._ahead, probe.middle_starts if objective is None else count)
@@ -469,12 +470,12 @@ class ForceRun(PolishRun[ForceAttempt]):
 
     @property
     def _is_short(self) -> bool:
-        """True if the front has fewer points than wanted."""
         return len(self._archive.front_indices()) < self._settings.fill.members
 
     def _is_far(self, objectives: Array) -> bool:
-        """Return True if objectives (2,) lie beyond the ends of the front, or in a gap wider than
-        `FAR_GAP`."""
+        """Return True if objectives (2,) lie beyond the front's ends, or in a gap wider than
+        `FAR_GAP`.
+        """
         f = [self._archive.objectives[k][0] for k in self._archive.front_indices()]
         place = int(np.searchsorted(f, objectives[0]))
         if place in (0, len(f)):
@@ -482,8 +483,9 @@ class ForceRun(PolishRun[ForceAttempt]):
         return gaps(self._archive)[place - 1].width > FAR_GAP
 
     def _gaps(self, solved: int) -> Iterator[ForceAttempt]:
-        """Yield attempts in gaps until the front has `solved` points or all sides of gaps were
-        tried; then add points on chords."""
+        """Yield attempts in gaps until the front has `solved` points or attempts started from all
+        sides of gaps; then add points on the lines across the remaining gaps.
+        """
         tried: set[Edge] = set()
         self._most_attempts += self._settings.fill.attempts * self._settings.attempts
         while self._attempts_left() > 0:
@@ -551,9 +553,8 @@ class ForceRun(PolishRun[ForceAttempt]):
             self._add_image(outcome.x)
 
     def _evaluate(self, attempt: ForceAttempt, x: Array) -> Evaluations:
-        """Evaluate x (n_var,) by the full model and certify it, unless it results from a probe.
-
-        Results of probes are certified later, if they remain on the front.
+        """Evaluate the result x (n_var,) of an attempt by the full model, and certify it unless it
+        results from a probe. Results of probes are certified later, if they remain on the front.
         """
         if attempt.mode == "brief":
             return self._evaluator.evaluate(x)
@@ -583,8 +584,9 @@ class ForceRun(PolishRun[ForceAttempt]):
     def _ends(
         self, objectives: tuple[int | None, ...], rng: np.random.Generator
     ) -> Iterator[ForceAttempt]:
-        """Yield one attempt for each given objective (None for the balanced middle), and count the
-        attempts without progress."""
+        """Yield one attempt for each objective (its index, or None for the balanced middle), and
+        count the attempts without progress.
+        """
         perturb = partial(perturb_start, self._evaluator, rng=rng)
         for objective in objectives:
             before, stalls = self._archive.best(objective)[1], self._stalls[objective]

@@ -64,12 +64,18 @@ class ParetoArchive:
         self.x[index], self.objectives[index], self.polished[index] = x, objectives, True
 
     def dominates(self, objectives: Array) -> bool:
-        """Return True if any point of the archive is at least as good as `objectives` (2,) in both
-        of them."""
+        """Return True if a point of the archive is at least as good in both objectives (2,) as the
+        given ones.
+        """
         return bool(np.any(np.all(np.array(self.objectives) <= objectives, axis=1)))
 
     def add(self, x: Array, objectives: Array) -> None:
-        """Add a new point with decision vector x (n_var,) and objectives (2,)."""
+        """Add a new point.
+
+        Args:
+            x: (n_var,) decision vector.
+            objectives: (2,) its objectives.
+        """
         self.x.append(x)
         self.objectives.append(objectives)
         self.parent.append(-1)
@@ -82,15 +88,16 @@ class ParetoArchive:
             values[:] = [value for k, value in enumerate(values) if k not in indices]
 
     def front_indices(self) -> list[int]:
-        """Return the indices of the non-dominated points, sorted by the first objective."""
+        """Return the indices of the non-dominated points, sorted by their first objective."""
         values = np.array(self.objectives)
         kept = np.flatnonzero(metrics.non_dominated(values))
         return [int(k) for k in kept[np.lexsort(values[kept].T[::-1])]]
 
     def best(self, objective: int | None) -> tuple[int, float]:
-        """Return the index and the value of the point with the least value.
+        """Return the index of the front's best point, and its value.
 
-        The value is the objective with index `objective`, or the sum of both objectives for None.
+        The best point has the least value: the objective with index `objective`, or the sum of both
+        objectives for None.
         """
         wanted = np.ones(2) if objective is None else np.eye(2)[objective]
         values = {k: float(wanted @ self.objectives[k]) for k in self.front_indices()}
@@ -125,7 +132,7 @@ AnyAttempt = TypeVar("AnyAttempt", bound=Attempt)
 
 
 class PolishRun(ABC, Generic[AnyAttempt]):
-    """The polish of one front, in progress.
+    """State of the polish of one front while it runs.
 
     Attributes:
         outcomes: results of all attempts so far.
@@ -145,26 +152,39 @@ class PolishRun(ABC, Generic[AnyAttempt]):
 
     @abstractmethod
     def attempts(self, rng: np.random.Generator) -> Iterator[AnyAttempt]:
-        """Yield the attempts one by one. The result of each is recorded before the next one is
-        made."""
+        """Yield the attempts one by one. The result of each attempt is recorded before the next one
+        is made.
+
+        Args:
+            rng: generator of random starts.
+        """
 
     @abstractmethod
     def _solve(self, attempt: AnyAttempt) -> Solution:
-        """Solve an attempt."""
+        """Run the solver of an attempt, and return its unchecked result."""
 
     @abstractmethod
     def _classify(
         self, attempt: AnyAttempt, answer: Solution, objectives: Array
     ) -> tuple[Status, str, Array]:
-        """Judge the objectives (2,) of an answer that the full model found feasible.
+        """Decide whether a result that the full model found feasible is an improvement.
+
+        Args:
+            attempt: the attempt.
+            answer: result of its solver.
+            objectives: (2,) objectives of the result by the full model.
 
         Returns:
             Status (accepted, optimal or rejected); the reason, '' if accepted; and the objectives
-            (2,) to record: the answer's if accepted, else the start's.
+            (2,) to record: those of the result if accepted, else those of the start.
         """
 
     def run(self, rng: np.random.Generator) -> None:
-        """Solve, check and record attempts as long as there are any."""
+        """Solve, check and record attempts as long as there are any.
+
+        Args:
+            rng: generator of random starts.
+        """
         for attempt in self.attempts(rng):
             if self._attempts_left() <= 0:
                 continue
@@ -196,7 +216,7 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         return self._most_attempts - len(self.outcomes)
 
     def _announce(self, attempts: int) -> None:
-        """Report that this many further attempts are expected."""
+        """Report how many further attempts are expected."""
         self._expected = attempts
         self._on_progress(len(self.outcomes), len(self.outcomes) + attempts)
 
@@ -210,7 +230,11 @@ class PolishRun(ABC, Generic[AnyAttempt]):
             self._archive.add(outcome.x, outcome.objectives)
 
     def _status(self, attempt: AnyAttempt, answer: Solution) -> tuple[Status, str, Array]:
-        """Evaluate an answer by the full model and certify it between the samples.
+        """Evaluate a solver's result by the full model, and certify it between the samples.
+
+        Args:
+            attempt: the attempt.
+            answer: result of its solver.
 
         Returns:
             Status, reason and objectives (2,) of the attempt, as `PolishOutcome` records them.
@@ -227,7 +251,12 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         return self._classify(attempt, answer, found.objectives[0])
 
     def _evaluate(self, attempt: AnyAttempt, x: Array) -> Evaluations:
-        """Evaluate x (n_var,) by the full model and certify it between the samples."""
+        """Evaluate the result of an attempt by the full model, and certify it between the samples.
+
+        Args:
+            attempt: the attempt; not used.
+            x: (n_var,) decision vector of the result.
+        """
         return self._evaluator.certified(self._evaluator.evaluate(x))
 
     def _not_improved(self, answer: Solution, attempt: AnyAttempt) -> tuple[Status, str, Array]:

@@ -40,13 +40,14 @@ GRASP_ROWS = 2
 
 @dataclass(frozen=True)
 class PointInequalities:
-    """The k inequalities mix . quantities <= bound that apply at every point.
+    """The k limits that apply at every point of a driven path: linear combinations of quantities,
+    each at most a bound.
 
-    Quantities are the limited ones: those of `driven_layout`, then robust forces or the forces of a
-    grasp's program. The bound is the force limit [N] or 1.
+    Quantities are those of `driven_layout`, followed by robust forces or by the forces that a
+    convex program computes. The bound is the force limit [N] or 1.
 
     Attributes:
-        mix: (k, quantities) coefficients.
+        mix: (k, quantities) coefficients of the linear combinations.
         is_force: (k,) True if the bound is the force limit.
         where, weight: (k, terms) indices and values of the nonzero coefficients.
     """
@@ -60,7 +61,8 @@ class PointInequalities:
     def from_workcell(cls, workcell: Workcell, robust: int = 0) -> PointInequalities:
         """Return the inequalities of a workcell.
 
-        A quantity that is limited in both signs has two of them, a normal force one per branch.
+        A quantity that is limited in both signs has two inequalities. A normal force has one per
+        branch, the linear functions whose maximum it is.
 
         Args:
             workcell: the cell.
@@ -83,8 +85,7 @@ class PointInequalities:
         return cls(mix, is_force, where, np.take_along_axis(mix, where, axis=1))
 
     def slopes(self, slope: Array, point: NDArray[np.intp], kind: NDArray[np.intp]) -> Array:
-        """Return the derivatives (rows, n) of mix . quantities for some inequalities at some
-        points.
+        """Return the derivatives (rows, n) of the left sides of some inequalities at some points.
 
         Args:
             slope: (points, quantities, n) derivatives of the quantities by n variables.
@@ -107,8 +108,8 @@ class IntervalGrid:
         moving: number of entries of the extended pose and its two derivatives by u, 3 (6 + m).
         kinds: inequalities that apply at every point.
         robust: computes robust forces; None if planned ones are limited.
-        layout: order of the quantities.
-        load: slice of the load among the quantities.
+        layout: order of the quantities that are limited at a point.
+        load: slice of the load (the force and moment that the box needs) among the quantities.
         rest: slice of the quantities that are limited at rest: the pressure shifts, or without a
             pressure limit the forces or the load from which they follow.
         has_pressure_limit: True if the contact model limits the shift of the pressure.
@@ -151,9 +152,13 @@ class IntervalGrid:
         self.variables = self.layout.variables
 
     def by_path(self, slope: Array, points: NDArray[np.intp]) -> Array:
-        """Convert derivatives (rows, moving) by the extended pose and its two derivatives, at the
-        points with indices `points` (rows,), to derivatives (rows, n_path) by the program's path
-        variables."""
+        """Convert derivatives by the extended pose and its two path derivatives to derivatives
+        (rows, n_path) by the program's path variables.
+
+        Args:
+            slope: (rows, moving) derivatives of one value per row.
+            points: (rows,) index of each row's point.
+        """
         rows, columns = self.workcell.task.free_entries
         at = self.sample[points]
         by_path = sum(
@@ -166,8 +171,12 @@ class IntervalGrid:
         return np.asarray(by_path @ self.spread)
 
     def path(self, waypoints: Array) -> tuple[Array, Array, Array]:
-        """Return the extended pose, its first and its second derivative by u, (intervals + 1, 6 +
-        m) each, at the grid points for extended waypoints (n_waypoints, 6 + m) [m, rad]."""
+        """Return the extended pose and its first and second derivative by u at the grid points,
+        (intervals + 1, 6 + m) each.
+
+        Args:
+            waypoints: (n_waypoints, 6 + m) extended waypoints [m, rad].
+        """
         first, second, third = (np.ascontiguousarray(b @ waypoints) for b in self._bases)
         return first, second, third
 
@@ -226,7 +235,7 @@ class IntervalValues:
         self.value, self.slope = value, slope
 
     def at_rest(self, force: float) -> tuple[Array, Array]:
-        """Compute how much of a limit the box at rest uses at the beginning of every interval.
+        """Compute which share of a limit the box at rest uses, at the beginning of every interval.
 
         The limit is the pressure shift; for pads without a pressure limit it is the force limit.
 
@@ -311,11 +320,12 @@ class IntervalValues:
 
 
 def _by_load(pressed: Mapping[str, Array], slope: Array) -> Array:
-    """Apply the chain rule from the load to the normal forces of a convex program.
+    """Apply the chain rule from the load (the force and moment that the box needs) to the normal
+    forces of a convex program.
 
     Args:
-        pressed: outputs of the program; `slope` (points, 2, 6) has the derivatives of both normal
-            forces by the load.
+        pressed: outputs of the convex program; `slope` (points, 2, 6) has the derivatives of both
+            normal forces by the load.
         slope: (points, 6, n) derivatives of the load by n variables.
 
     Returns:
@@ -325,9 +335,17 @@ def _by_load(pressed: Mapping[str, Array], slope: Array) -> Array:
 
 
 def _followed(grid: IntervalGrid, full: Array, follow: Sequence[Array]) -> Array:
-    """Eliminate the joints from derivatives `full` by all variables of a point, because they follow
-    the pose with the derivatives `follow` of each arm. Return derivatives by the extended pose, its
-    two derivatives, u'' and u'^2."""
+    """Eliminate the joints from derivatives, because the joints follow the pose.
+
+    Args:
+        grid: shared data.
+        full: (points, quantities, variables) derivatives by all variables of a point.
+        follow: for each arm, derivatives (points, pose, n) of its n joints by the extended pose.
+
+    Returns:
+        (points, quantities, moving + 2) derivatives by the extended pose, its two path derivatives,
+        u'' and u'^2.
+    """
     slope = np.concatenate([full[:, :, : grid.moving], full[:, :, -2:]], axis=2)
     start = grid.moving
     for along in follow:
@@ -443,8 +461,12 @@ class PathTimingProgram:
         self._speeds(squared)
 
     def _still(self, values: IntervalValues) -> None:
-        """Append rows that limit the use at rest to the geometric rows, without their small
-        curvature."""
+        """Append rows that limit the forces or pressure of the box at rest to the geometric rows.
+        Their small curvature is neglected.
+
+        Args:
+            values: limited quantities of the iterate.
+        """
         share, slope = values.at_rest(self._force)
         near = np.flatnonzero(share > NEARLY_USED)
         begins = 2 * (near // (len(share) // self._grid.intervals))
@@ -484,8 +506,13 @@ class PathTimingProgram:
         self._column = np.clip(np.repeat(np.arange(n), 2) - 1, 0, n - 3)
 
     def geometry_after(self, d: Array) -> Array:
-        """Return each geometric row's nonlinearity (geometric rows,) along a step d (n,): the
-        violation after the step minus its linear prediction."""
+        """Return the error (geometric rows,) of each geometric row's linear model along a step.
+
+        The error is the violation after the step minus its linear prediction.
+
+        Args:
+            d: (n,) the step.
+        """
         x, step = self._x.copy(), d[: self.n_path]
         x[: len(self._spread)] += self._spread @ step
         lacking = self._required - self._places.values(x)
@@ -503,8 +530,12 @@ class PathTimingProgram:
         return np.asarray(self.rows > threshold)
 
     def predicted(self, d: Array) -> Array:
-        """Predict linearly the timing rows (points, kinds), less their bounds, after a step d
-        (n,)."""
+        """Predict linearly the timing rows (points, kinds) after a step: limited quantities over
+        their bounds, less one.
+
+        Args:
+            d: (n,) the step.
+        """
         omega = d[self.speeds]
         moved = self._grid.moved @ d[: self.n_path]
         beside = np.stack([omega[self._column], omega[self._column + 1]], axis=1)
@@ -517,7 +548,8 @@ class PathTimingProgram:
 
         Args:
             chosen: (points, kinds) mask of the timing rows to include.
-            bent: (geometric rows,) nonlinearity along an earlier step, added to the geometric rows.
+            bent: (geometric rows,) error of the rows' linear model along an earlier step, added to
+                the geometric rows.
         """
         self._learn(*np.nonzero(chosen & ~self._known))
         point, kind = np.nonzero(chosen)
@@ -536,7 +568,11 @@ class PathTimingProgram:
         return LinearisedRows(A, b, scale, point, kind)
 
     def _learn(self, point: NDArray[np.intp], kind: NDArray[np.intp]) -> None:
-        """Compute and store the derivatives of timing rows, given by points and inequalities."""
+        """Compute and store the derivatives of timing rows.
+
+        Args:
+            point, kind: (rows,) index of the point and of the inequality of each row.
+        """
         kinds, moving = self._grid.kinds, self._grid.moving
         local = kinds.slopes(self._values.slope, point, kind) / self.scale[kind, None]
         self._by_path[point, kind] = self._grid.by_path(local[:, :moving], point)
@@ -548,7 +584,11 @@ class PathTimingProgram:
         return np.concatenate([np.zeros(self.n_path), self.cost])
 
     def gain(self, d: Array) -> float:
-        """Predict to second order the relative reduction of the duration by a step d (n,)."""
+        """Predict to second order the relative reduction of the duration by a step.
+
+        Args:
+            d: (n,) the step.
+        """
         omega = d[self.speeds]
         bent = self.cost_diagonal @ omega**2 / 2.0 + self.cost_beside @ (omega[:-1] * omega[1:])
         return -float(self.cost @ omega + bent)
@@ -556,8 +596,12 @@ class PathTimingProgram:
     def curvature(
         self, linear: LinearisedRows | None = None, rows: Array | None = None
     ) -> BorderedMatrix:
-        """Return the Hessian of the objective, or of the Lagrangian if linearised rows `linear` and
-        their multipliers `rows` (rows,) are given."""
+        """Return the Hessian of the objective, or of the Lagrangian.
+
+        Args:
+            linear: linearised rows; None for the objective alone.
+            rows: (rows,) multipliers of the linearised rows; None for the objective alone.
+        """
         n_path, n = self.n_path, len(self.cost)
         corner, beside = np.zeros((n_path, n_path)), np.zeros((n, n_path))
         diagonal, off = self.cost_diagonal.copy(), self.cost_beside.copy()

@@ -50,8 +50,8 @@ HIGH_RATIO, LOW_RATIO = 0.7, 0.3
 class TrustRegion:
     """Radius of the trust region and its update rule.
 
-    The region is a box, so that it adds only bounds to a program. A step that violated a row which
-    its program lacked is repeated at the same radius with this row.
+    The region is a box, so that it adds only bounds to a program. If a step violates a row (scalar
+    inequality) that its program lacked, the program is repeated at the same radius with this row.
 
     Attributes:
         radius: half the width of the box [half ranges of the decision variables].
@@ -72,8 +72,11 @@ class TrustRegion:
         return self.radius < self._least
 
     def is_step_bounded(self, length: float) -> bool:
-        """Return True if the box limited a step whose largest change of a scaled variable is
-        `length`."""
+        """Return True if the box limited a step.
+
+        Args:
+            length: largest change of a scaled variable in the step.
+        """
         return length >= BOUNDED_SHARE * self.radius
 
     def on_failed_subproblem(self) -> None:
@@ -93,8 +96,8 @@ class TrustRegion:
         """Halve the radius after a rejected step.
 
         Args:
-            is_new: True if a violated row is new; the radius then stays, because the program was
-                wrong.
+            is_new: True if a violated row (scalar inequality) was not in the program; the radius
+                then stays, because the program was wrong.
             length: largest change of a scaled variable in the step, from which the radius is halved
                 if it is smaller than the radius.
         """
@@ -136,7 +139,7 @@ class Solution:
         residuals: optimality residuals at x, of the last program.
         iterations: number of solver iterations, over all trust-region iterations.
         rounds: number of trust-region iterations.
-        rows: number of rows at places of the path in the last program.
+        rows: number of rows (scalar inequalities) at places of the path in the last program.
     """
 
     x: Array
@@ -171,7 +174,7 @@ class Step:
 
     Attributes:
         length: largest change of a scaled variable.
-        required: value that each row of the program had to exceed.
+        required: value that each row (scalar inequality) of the program had to exceed.
         residuals: function from an iterate to its optimality residuals in this program.
         iterations: number of solver iterations.
         is_stationary: True if the iterate from which the step starts is stationary.
@@ -197,7 +200,8 @@ class StepEvaluation(Generic[AnyIterate]):
     """Evaluation of a step by the full model.
 
     Attributes:
-        trial: iterate after the step; None if the step is no improvement and adds no row.
+        trial: iterate after the step; None if the step is no improvement and reveals no row (scalar
+            inequality) that the program lacks.
         improved: True if the trial has a lower level than the best iterate.
         factor: factor on the radius after a step without improvement.
         reduction_ratio: actual over predicted reduction of the level; None without a prediction.
@@ -221,7 +225,7 @@ class StepMethod(ABC, Generic[AnyIterate, AnyStep]):
 
     Attributes:
         cell: shared data of the polish.
-        active: selects the rows near a candidate.
+        active: selects the rows (scalar inequalities) near a candidate.
         reader: evaluates candidates at places of the path.
         half: (n,) half ranges of the variables that steps change [m, rad].
         limits: for each robot, True if its normal force is minimised.
@@ -248,7 +252,11 @@ class StepMethod(ABC, Generic[AnyIterate, AnyStep]):
 
     @abstractmethod
     def evaluate(self, x: Array) -> AnyIterate:
-        """Evaluate a decision vector x (n_var,) by the full model."""
+        """Evaluate a candidate by the full model.
+
+        Args:
+            x: (n_var,) decision vector.
+        """
 
     @abstractmethod
     def propose_step(
@@ -258,7 +266,7 @@ class StepMethod(ABC, Generic[AnyIterate, AnyStep]):
 
         Args:
             best: the best iterate so far.
-            required: value that each row of the program has to exceed.
+            required: value that each row (scalar inequality) of the program has to exceed.
             radius: half the width of the trust region [half ranges of the variables].
 
         Returns:
@@ -267,7 +275,12 @@ class StepMethod(ABC, Generic[AnyIterate, AnyStep]):
 
     @abstractmethod
     def evaluate_step(self, best: AnyIterate, step: AnyStep) -> StepEvaluation[AnyIterate]:
-        """Evaluate the candidate after a step from the best iterate."""
+        """Evaluate the candidate after a step by the full model.
+
+        Args:
+            best: the best iterate so far, from which the step starts.
+            step: the step.
+        """
 
     @abstractmethod
     def evaluate_fraction(
@@ -286,9 +299,13 @@ class StepMethod(ABC, Generic[AnyIterate, AnyStep]):
         """
 
     def missing_rows(self, trial: AnyIterate) -> set[Row]:
-        """Return rows that a program should have contained, found at the candidate after its step.
+        """Return rows (scalar inequalities) that a program should have contained, found at the
+        candidate after its step.
 
-        It is called after a step that violated nothing but did not improve.
+        The method is called after a step that violated nothing but did not improve.
+
+        Args:
+            trial: candidate after the step.
         """
         return set()
 
@@ -409,8 +426,8 @@ class TrustRegionSolve(Generic[AnyIterate, AnyStep]):
     def _keep_best(self, step: AnyStep, trial: AnyIterate) -> None:
         """React to a step that violates nothing but does not improve.
 
-        Rows that the program lacked are added. Without such rows the solve finishes if the step is
-        optimal and inside the box, else the radius shrinks.
+        Rows (scalar inequalities) that the program lacked are added. Without such rows the solve
+        finishes if the step is optimal and inside the box, else the radius shrinks.
 
         Args:
             step: the step.

@@ -22,10 +22,11 @@ class PolishOutcome:
     """Outcome of one attempt.
 
     Attributes:
-        aim: 'point' improves a point of the given front; 'extreme', 'balance' and 'gap' look for
-            new points; 'probe' is a short solve that chooses where to look.
+        aim: purpose of the attempt. 'point' improves a point of the given front; 'extreme',
+            'balance' and 'gap' look for new points; 'probe' is a short solve that chooses where to
+            look.
         parent: index of the point of the given front that is improved, -1 for a new point.
-        status: accepted; optimal (no improvement beyond the tolerance: the original stays);
+        status: accepted; optimal (no improvement beyond the tolerance, so the start stays);
             rejected by the full evaluation; failed in the solver.
         reason: reason why the attempt was not accepted, else ''.
         x: (n_var,) new decision vector if accepted, otherwise the start.
@@ -34,7 +35,7 @@ class PolishOutcome:
         residuals: optimality residuals of the solver's last result, accepted or not.
         iterations: solver iterations, over all trust-region iterations.
         rounds: number of trust-region iterations.
-        rows: number of rows at places of the path in the last program.
+        rows: number of rows (scalar inequalities) at places of the path in the last program.
         seconds: wall time of the attempt, full evaluation and certification included.
     """
 
@@ -133,7 +134,7 @@ class PolishedFront:
 
     @property
     def counts(self) -> dict[str, int]:
-        """Count the attempts by status.
+        """Number of attempts by status.
 
         Attempts that were not accepted are also counted by 'status: reason'.
         """
@@ -143,7 +144,7 @@ class PolishedFront:
 
     @property
     def effort(self) -> PolishEffort:
-        """Return the record of effort and success."""
+        """Record of the effort and success of the polish."""
         own = [o.status in ("accepted", "optimal") for o in self.outcomes if o.aim == "point"]
         # Others were judged as they are, without a solver.
         solved = [o for o in self.outcomes if o.rounds or o.status == "failed"]

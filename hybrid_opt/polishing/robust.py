@@ -40,6 +40,9 @@ class RobustSamples:
     def __init__(self, workcell: Workcell) -> None:
         """Load or build the compiled functions.
 
+        Args:
+            workcell: the cell.
+
         Raises:
             SettingsError: the pads have no robust forces, or the uncertainty leaves no friction or
                 patch.
@@ -102,7 +105,8 @@ class RobustForces:
         self._branches = planned_branches(workcell)
 
     def at(self, path: Sequence[Array], a: Array, w: Array) -> tuple[Array, Array]:
-        """Compute the robust forces of the most demanding cases, and their slopes.
+        """Compute the robust forces in the most demanding cases of the uncertainty, and their
+        derivatives.
 
         Args:
             path: extended poses, and their first and second derivatives by u, (points, pose) each.

@@ -36,10 +36,13 @@ from translation: the least forces at the ends of a path are in that kink."""
 
 @dataclass(frozen=True, order=True)
 class ForceRow:
-    """The row that keeps one branch of a robot's normal force at a sample below its peak force.
+    """The inequality that keeps a robot's normal force at a sample below its peak force.
 
-    A branch is one of the linear functions whose maximum is the normal force. It is
-    `PROGRAM_BRANCH` if a convex program computes the force.
+    Attributes:
+        robot: index of the robot.
+        branch: index of one of the linear functions whose maximum is the normal force;
+            `PROGRAM_BRANCH` if a convex program computes the force.
+        sample: index of the sample.
     """
 
     robot: int
@@ -49,7 +52,12 @@ class ForceRow:
 
 @dataclass(frozen=True, order=True)
 class PressureRow:
-    """The row that keeps a robot's centre of pressure within its patch at a sample."""
+    """The inequality that keeps a robot's centre of pressure within its patch at a sample.
+
+    Attributes:
+        robot: index of the robot.
+        sample: index of the sample.
+    """
 
     robot: int
     sample: int
@@ -57,7 +65,12 @@ class PressureRow:
 
 @dataclass(frozen=True)
 class PathRow:
-    """The row of one geometric constraint at one place of the path."""
+    """The inequality of one geometric constraint at one place of the path.
+
+    Attributes:
+        constraint: the constraint.
+        place: index of the place.
+    """
 
     constraint: PathConstraint
     place: int
@@ -68,12 +81,13 @@ Row = ForceRow | PressureRow | PathRow
 
 @cache
 def _sort_key(constraint: PathConstraint) -> tuple[str, str]:
-    """Return a key to sort constraints by kind, then by the text of their fields."""
+    """Return a key that sorts constraints by their kind, then by the text of their fields."""
     return constraint.family.rstrip("_0123456789"), repr(constraint)
 
 
 class RowLayout:
-    """Order of a program's rows: blocks of forces, objectives, patches and places, each sorted.
+    """Order of a program's rows (scalar inequalities): blocks of forces, objectives, patches and
+    places, each sorted.
 
     Attributes:
         force_rows, pressure_rows, place_rows: rows of the blocks of forces, patches and places.
@@ -211,11 +225,18 @@ class ConstraintRows:
         )
 
     def _lay_out_samples(self, layout: RowLayout) -> dict[str, Any]:
-        """Return the arguments of `rows.cpp` for force and pressure rows.
+        """Prepare the evaluation of force and pressure rows.
 
-        Forces without closed form follow from a sample's load by a convex program
-        (`symbolic.smooth.samples.grasp_force_functions`), which is solved once per load. Their
-        derivatives follow by the chain rule.
+        Forces without closed form follow by a convex program
+        (`symbolic.smooth.samples.grasp_force_functions`) from the load of a sample, the force and
+        moment that the box needs. The program is solved once per load. Derivatives follow by the
+        chain rule.
+
+        Args:
+            layout: order of the rows.
+
+        Returns:
+            Arguments of `rows.cpp` by name.
         """
         cell, rows = self._cell, layout.force_rows
         own = sorted({row.sample for row in rows if row.branch == PROGRAM_BRANCH})
@@ -257,7 +278,7 @@ class ConstraintRows:
         }
 
     def _lay_out_places(self, layout: RowLayout, q: tuple[Array, Array]) -> dict[str, Any]:
-        """Return the arguments of `rows.cpp` for place rows, grouped by their functions.
+        """Return the arguments of `rows.cpp` by name for place rows, grouped by their functions.
 
         Args:
             layout: order of the rows.
@@ -402,6 +423,10 @@ def row_numbers(
     constraints: Sequence[PathConstraint], functions: PolishFunctions
 ) -> tuple[Array, ...]:
     """Collect the parameters of constraints that share one compiled function.
+
+    Args:
+        constraints: the constraints.
+        functions: compiled functions of the polish.
 
     Returns:
         A tuple with one array (n constraints, n parameters); an empty tuple if the constraints have

@@ -134,14 +134,28 @@ class Start:
     is_exhausted: bool = False
 
     def value(self, objective: int | None) -> float:
-        """Return the objective with this index, or the sum of both objectives for None."""
+        """Return one objective of the start, or the sum of both.
+
+        Args:
+            objective: index of the objective; None for the sum.
+        """
         return float(self.objectives.sum() if objective is None else self.objectives[objective])
 
 
 def random_starts(
     evaluator: CandidateEvaluator, count: int, rng: np.random.Generator
 ) -> list[Start]:
-    """Draw `RANDOM_CANDIDATES` uniform candidates and return at most `count` feasible ones."""
+    """Draw `RANDOM_CANDIDATES` uniform candidates within the bounds, and return the first feasible
+    ones.
+
+    Args:
+        evaluator: evaluator of the candidates.
+        count: largest number of candidates to return.
+        rng: generator of the candidates.
+
+    Returns:
+        Feasible candidates, at most `count`.
+    """
     shape = RANDOM_CANDIDATES, evaluator.n_var
     candidates = rng.uniform(evaluator.lower, evaluator.upper, shape)
     rows, objectives = first_feasible(evaluator, candidates, count)
@@ -162,8 +176,11 @@ class Mirror:
     shift: Array
 
     def image(self, x: Array) -> Array | None:
-        """Return the mirror image (n_var,) of a decision vector x (n_var,); None if it violates a
-        bound."""
+        """Return the mirror image (n_var,) of a decision vector; None if it violates a bound.
+
+        Args:
+            x: (n_var,) decision vector.
+        """
         low, high, image = self.task.lower, self.task.upper, self.sign * x + self.shift
         inside = (image >= low - MIRROR_TOLERANCE) & (image <= high + MIRROR_TOLERANCE)
         return np.clip(image, low, high) if inside.all() else None

@@ -71,7 +71,8 @@ class RowSelector:
         }
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> set[Row]:
-        """Return the rows of all kinds of constraints that are near their bounds at a candidate.
+        """Return the rows (scalar inequalities) of all kinds of constraints that are near their
+        bounds at a candidate.
 
         Args:
             carry: the candidate, evaluated at places of the path.
@@ -87,7 +88,8 @@ class RowSelector:
     def violated_rows(
         self, carry: PlacedCarry, known: PlacedCarry, program_rows: Collection[Row]
     ) -> set[Row]:
-        """Return the rows of all kinds of constraints that are violated after a step.
+        """Return the rows (scalar inequalities) of all kinds of constraints that are violated after
+        a step.
 
         Args:
             carry: candidate after the step.
@@ -127,7 +129,7 @@ class RowSelector:
     def required_values(
         self, carry: PlacedCarry, rows: Iterable[Row], is_relaxed: bool = False
     ) -> dict[Row, float]:
-        """Return for each row the value that it has to exceed in the next program.
+        """Return the bound that each row (scalar inequality) has to exceed in the next program.
 
         Args:
             carry: the candidate about which the program is formed.
@@ -146,7 +148,7 @@ class RowSelector:
         rows: Iterable[Row],
         before: Mapping[Row, float],
     ) -> dict[Row, float]:
-        """Return for each row that a step violated the value that it has to exceed from now on.
+        """Return the new, stricter bound of each row (scalar inequality) that a step violated.
 
         Args:
             carry: candidate after the step.
@@ -161,7 +163,8 @@ class RowSelector:
         return values
 
     def persists(self, row: Row) -> bool:
-        """Return True if a tightened bound of this row stays valid at other candidates.
+        """Return True if a tightened bound of a row (scalar inequality) stays valid at other
+        candidates.
 
         If not, the bound is relative to the candidate at which it was measured.
         """
@@ -181,7 +184,8 @@ class RowSelector:
 
 
 class WorkingSet:
-    """Rows that a solve keeps in its programs, besides the rows that are near their bounds.
+    """Rows (scalar inequalities) that a solve keeps in its programs, besides the rows that are near
+    their bounds.
 
     These are rows that a rejected step violated, each with the value that it has to exceed, and
     rows that were active in one of the last programs.
@@ -191,7 +195,8 @@ class WorkingSet:
         """Start with no rows.
 
         Args:
-            active: selector of rows, which knows whose tightened bounds persist.
+            active: selector of rows, which knows whether a row's tightened bound stays valid at
+                other candidates.
             half: (n,) half ranges of the variables that steps change [m, rad].
         """
         self._active, self._half = active, half
@@ -204,13 +209,14 @@ class WorkingSet:
         return {*self._tightened, *self._active_for}
 
     def tighten(self, required: dict[Row, float], x: Array, radius: float) -> None:
-        """Raise the required values of rows in place to the share of their tightening that counts.
+        """Raise the required values of tightened rows (scalar inequalities), in place, by a share
+        of their tightening.
 
         The share is the trust region's radius over the distance to the candidate at which the row
         was tightened, at most one.
 
         Args:
-            required: value that each row of the next program has to exceed.
+            required: value that each row of the next program has to exceed, which is changed.
             x: decision vector about which the next program is formed; its first n entries are the
                 variables that steps change.
             radius: radius of the trust region [half ranges of the variables].
@@ -224,7 +230,7 @@ class WorkingSet:
     def learn_from_rejection(
         self, bounds: Mapping[Row, float], x: Array, required: Mapping[Row, float]
     ) -> bool:
-        """Add the rows that a rejected step violates.
+        """Add the rows (scalar inequalities) that a rejected step violates.
 
         Args:
             bounds: tightened bound of each violated row.
@@ -243,7 +249,7 @@ class WorkingSet:
         return is_new
 
     def add(self, rows: Iterable[Row], x: Array) -> None:
-        """Add rows that a program lacked, without tightening their bounds.
+        """Add rows (scalar inequalities) that a program lacked, without tightening their bounds.
 
         Args:
             rows: the missing rows.
@@ -252,12 +258,17 @@ class WorkingSet:
         self._tightened.update(dict.fromkeys(rows, (-np.inf, x)))
 
     def mark_active(self, rows: Iterable[Row]) -> None:
-        """Keep rows with a nonzero multiplier for the next `ACTIVE_ROW_LIFETIME` programs."""
+        """Keep rows (scalar inequalities) in the next `ACTIVE_ROW_LIFETIME` programs.
+
+        Args:
+            rows: rows that have a nonzero multiplier in the last program.
+        """
         left = {row: count - 1 for row, count in self._active_for.items() if count > 1}
         self._active_for = left | dict.fromkeys(rows, ACTIVE_ROW_LIFETIME)
 
     def on_new_best(self, keep_active_set: bool = False) -> None:
-        """Discard the tightened bounds that are relative to the former best candidate.
+        """Discard the tightened bounds that are relative to the former best candidate, because a
+        better one was found.
 
         Args:
             keep_active_set: False to discard also the rows that were active in the last programs.

@@ -83,10 +83,11 @@ class DistanceConstraintKind(ConstraintKind[PathRow]):
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[PathRow], is_relaxed: bool = False
     ) -> list[float]:
-        """Return for each row the wanted distance minus the error of the smooth bound [m].
+        """Return the bound that each row (scalar inequality) has to exceed [m]: the wanted distance
+        minus the error of the smooth model.
 
-        The error is the measured least distance in the row's window minus the bound's value. A row
-        at a place that an arm does not reach gets the small value `PATCH_MARGIN`.
+        The error is the measured least distance in the row's window minus the smooth model's value.
+        A row at a place that an arm does not reach gets the small value `PATCH_MARGIN`.
 
         Args:
             carry: the candidate, evaluated at places of the path.
@@ -118,20 +119,34 @@ def pair_of(row: PathRow) -> int:
 
 
 class Clearances(DistanceConstraintKind):
-    """Rows on the distances of pairs that include a body of an arm, where the distance is least."""
+    """Rows (scalar inequalities) on the distances of pairs of bodies that include a body of an arm,
+    at the places of least distance.
+    """
 
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows at the local minima of distances with lower bounds below `BODY_DISTANCE`."""
+        """Return rows at the local minima of distances with lower bounds below `BODY_DISTANCE`.
+
+        Args:
+            carry: the candidate, evaluated at places of the path.
+            limits: not used.
+        """
         for pair in np.flatnonzero(carry.distances.bounds.min(axis=0) < BODY_DISTANCE).tolist():
             if pair not in self.separable:
                 for place in local_minima_below(carry.distances.bounds[:, pair], BODY_DISTANCE):
                     yield PathRow(Clearance(pair, self._columns[pair]), place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return rows for pairs that are too close: at the place of the least distance, at the next
-        place, and at some distance before and after."""
+        """Return rows for pairs of bodies that are too close.
+
+        They lie at the place of the least distance, at the next place, and at some distance before
+        and after.
+
+        Args:
+            carry: candidate after the step.
+            known: candidate before the step; not used.
+        """
         width = self.grid.places(BESIDE_CLEARANCE)
         for pair, distance in carry.distances.closer_than(self.least).items():
             if pair in self.separable:
@@ -143,15 +158,22 @@ class Clearances(DistanceConstraintKind):
 
 
 class SeparatingAxisGaps(DistanceConstraintKind):
-    """Rows on the gap between payload and an obstacle box along one direction.
+    """Rows (scalar inequalities) on the gap between payload and an obstacle box along one
+    direction.
 
     They lie away from kinks, the places at which the direction of the largest gap changes.
     """
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows at regular distances along every stretch on which the payload is near a box.
+        """Return rows at regular distances along every stretch of the path on which the payload is
+        near a box.
 
-        None of them lies closer than `BESIDE_KINK` to a kink.
+        No row lies closer than `BESIDE_KINK` to a kink, a place at which the direction of the
+        largest gap changes.
+
+        Args:
+            carry: the candidate, evaluated at places of the path.
+            limits: not used.
         """
         grid = self.grid
         beside = grid.places(BESIDE_KINK)
@@ -174,8 +196,12 @@ class SeparatingAxisGaps(DistanceConstraintKind):
         """Return rows where the payload is too close to a box after a step, and at some distance
         before and after.
 
-        Each has the direction of the largest gap before the step. Places near a kink of the
-        candidate before the step are left to `AxisSwitchGaps`.
+        Each row has the direction of the largest gap before the step. Places near a kink, where
+        this direction changes, are left to `AxisSwitchGaps`.
+
+        Args:
+            carry: candidate after the step.
+            known: candidate before the step.
         """
         half = self.grid.places(KINK_WINDOW) // 2
         for pair, gaps, place, near in violated_passages(self, carry, known):
@@ -186,23 +212,35 @@ class SeparatingAxisGaps(DistanceConstraintKind):
 
 
 class AxisSwitchGaps(DistanceConstraintKind):
-    """Rows on the height of a kink, at which the payload passes an edge of a box."""
+    """Rows (scalar inequalities) on the gap at a kink, the place at which the payload passes an
+    edge of a box.
+    """
 
     def __init__(self, cell: SmoothCell) -> None:
         super().__init__(cell)
         self.window = cell.grid.places(KINK_WINDOW)
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return a row for each kink of the clearance that is lower than `KINK_DISTANCE`."""
+        """Return a row for each kink (the payload passes an edge of a box) whose gap is below
+        `KINK_DISTANCE`.
+
+        Args:
+            carry: the candidate, evaluated at places of the path.
+            limits: not used.
+        """
         for pair, gaps in near_gaps(self, carry):
             for kink, place in edges(gaps, KINK_DISTANCE):
                 yield passing(pair, gaps, kink, place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return a row for each kink near a place where the payload is too close to a box after a
-        step.
+        """Return a row for each kink (the payload passes an edge of a box) near a place where the
+        payload is too close after a step.
 
         The kinks are those of the candidate before the step.
+
+        Args:
+            carry: candidate after the step.
+            known: candidate before the step.
         """
         for pair, gaps, _, near in violated_passages(self, carry, known):
             for kink, place in near:
@@ -231,7 +269,8 @@ class Gaps:
 
 
 def edges(gaps: Gaps, limit: float) -> list[tuple[int, int]]:
-    """Find the kinks at which the largest gap changes from a falling to a rising one.
+    """Find the kinks: between two places the direction of the largest gap changes, and the gap from
+    falling to rising.
 
     Args:
         gaps: gaps of one pair along the path.
@@ -252,10 +291,11 @@ def edges(gaps: Gaps, limit: float) -> list[tuple[int, int]]:
 
 
 def passing(pair: int, gaps: Gaps, kink: int, place: int) -> PathRow:
-    """Return the row for a kink of a pair.
+    """Return the row (scalar inequality) for a kink, at which the payload passes an edge of an
+    obstacle box.
 
     Args:
-        pair: index of the pair.
+        pair: index of the pair of payload and obstacle.
         gaps: gaps of the pair along the path.
         kink: index of the place before the kink.
         place: index of the place of the row.
@@ -265,10 +305,11 @@ def passing(pair: int, gaps: Gaps, kink: int, place: int) -> PathRow:
 
 
 def separation(pair: int, gaps: Gaps, place: int) -> PathRow:
-    """Return the row for the largest gap of a pair at a place.
+    """Return the row (scalar inequality) for the largest gap between payload and obstacle at a
+    place.
 
     Args:
-        pair: index of the pair.
+        pair: index of the pair of payload and obstacle.
         gaps: gaps of the pair along the path.
         place: index of the place of the row.
     """
@@ -276,12 +317,15 @@ def separation(pair: int, gaps: Gaps, place: int) -> PathRow:
 
 
 def near_gaps(kind: DistanceConstraintKind, carry: PlacedCarry) -> Iterable[tuple[int, Gaps]]:
-    """Yield the index and the gaps of every separable pair that comes nearer than
-    `FAR_GAP_DISTANCE`.
+    """Yield the gaps of every separable pair that comes nearer than `FAR_GAP_DISTANCE`. A separable
+    pair is the payload and an obstacle that is a single box.
 
     Args:
         kind: kind of constraint, which knows the separable pairs.
         carry: the candidate, evaluated at places of the path.
+
+    Yields:
+        Index of the pair, and its gaps.
     """
     for pair in np.flatnonzero(carry.distances.bounds.min(axis=0) < FAR_GAP_DISTANCE).tolist():
         if pair in kind.separable:
@@ -291,7 +335,8 @@ def near_gaps(kind: DistanceConstraintKind, carry: PlacedCarry) -> Iterable[tupl
 def violated_passages(
     kind: DistanceConstraintKind, carry: PlacedCarry, known: PlacedCarry
 ) -> Iterable[tuple[int, Gaps, int, list[tuple[int, int]]]]:
-    """Yield the places at which a separable pair is too close after a step.
+    """Yield the places at which a separable pair, payload and a box-shaped obstacle, is too close
+    after a step.
 
     Args:
         kind: kind of constraint, which knows the separable pairs and their least distances.

@@ -69,7 +69,8 @@ AnyRow = TypeVar("AnyRow", ForceRow, PressureRow, PathRow)
 
 
 class ConstraintKind(ABC, Generic[AnyRow]):
-    """One kind of constraint: which rows it has near a candidate, and what they have to exceed.
+    """One kind of constraint: selects its rows (scalar inequalities) near a candidate, and sets
+    their bounds.
 
     Attributes:
         cell: shared data of the polish of a workcell.
@@ -85,7 +86,8 @@ class ConstraintKind(ABC, Generic[AnyRow]):
 
     @abstractmethod
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[AnyRow]:
-        """Return the rows of this kind that are near their bounds at a candidate.
+        """Return the rows (scalar inequalities) of this kind that are near their bounds at a
+        candidate.
 
         Args:
             carry: the candidate, evaluated at places of the path.
@@ -94,7 +96,7 @@ class ConstraintKind(ABC, Generic[AnyRow]):
 
     @abstractmethod
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[AnyRow]:
-        """Return the rows of this kind that are violated after a step.
+        """Return the rows (scalar inequalities) of this kind that are violated after a step.
 
         Args:
             carry: candidate after the step.
@@ -104,7 +106,8 @@ class ConstraintKind(ABC, Generic[AnyRow]):
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[AnyRow], is_relaxed: bool = False
     ) -> list[float]:
-        """Return for each row the value that it has to exceed in a program about a candidate.
+        """Return the bound that each row (scalar inequality) has to exceed in a program about a
+        candidate.
 
         Args:
             carry: the candidate, evaluated at places of the path.
@@ -116,7 +119,7 @@ class ConstraintKind(ABC, Generic[AnyRow]):
     def tightened_bounds(
         self, carry: PlacedCarry, known: PlacedCarry, rows: Sequence[AnyRow], before: list[float]
     ) -> list[float]:
-        """Return for each row that a step violated the value that it has to exceed from now on.
+        """Return the new, stricter bound of each row (scalar inequality) that a step violated.
 
         Args:
             carry: candidate after the step.
@@ -128,7 +131,8 @@ class ConstraintKind(ABC, Generic[AnyRow]):
 
 
 class Forces(ConstraintKind[ForceRow]):
-    """Rows that keep normal forces below the peak forces, which are variables of the program.
+    """Rows (scalar inequalities) that keep normal forces below the peak forces, which are variables
+    of the program.
 
     A normal force is the largest of several linear functions (branches) of the required force. The
     branch with tight friction cones has rows along the whole path, other branches only where they
@@ -152,7 +156,12 @@ class Forces(ConstraintKind[ForceRow]):
         """Return force rows at regular distances along the path, and at and beside the local maxima
         of the normal forces.
 
-        A robot whose force only breaks ties has rows at fewer samples.
+        A robot whose force is not minimised, but only decides between equal candidates, has rows at
+        fewer samples.
+
+        Args:
+            carry: the candidate, evaluated at places of the path.
+            limits: for each robot, True if its normal force is minimised.
         """
         samples = self._every | self._ends | self._peaks(carry)
         for robot, limited in enumerate(limits):
@@ -161,14 +170,25 @@ class Forces(ConstraintKind[ForceRow]):
         yield from self._other_branches(carry)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[ForceRow]:
-        """Return rows for branches other than that with tight friction cones, at samples where one
-        of them is, or nearly is, the largest."""
+        """Return rows for those branches of the normal forces that have no rows along the whole
+        path.
+
+        They lie at samples where such a branch is the largest, or nearly so.
+
+        Args:
+            carry: candidate after the step.
+            known: candidate before the step; not used.
+        """
         return self._other_branches(carry)
 
     def peak_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> set[ForceRow]:
         """Return rows at and beside the local maxima of a candidate's minimised normal forces.
 
         A program without these rows underestimates the peak forces.
+
+        Args:
+            carry: the candidate, evaluated at places of the path.
+            limits: for each robot, True if its normal force is minimised.
         """
         return {
             ForceRow(robot, self._main, sample)
@@ -178,11 +198,13 @@ class Forces(ConstraintKind[ForceRow]):
         }
 
     def _values(self, carry: PlacedCarry) -> Array:
-        """Compute every branch (samples, 2, branches) of both robots' normal forces [N]."""
+        """Compute the normal forces (samples, 2, branches) of both robots by every branch [N]."""
         return np.asarray(np.einsum("rbk,nk->nrb", self.cell.coefficients, carry.split))
 
     def _peaks(self, carry: PlacedCarry) -> set[int]:
-        """Return the samples at local maxima of either robot's normal force, and beside them."""
+        """Return the indices of samples at local maxima of either robot's normal force, and of both
+        neighbours.
+        """
         has_branches = self.cell.robust is None and self._main == CONE_TIGHT
         force = self._values(carry).max(axis=2) if has_branches else carry.force
         inner = force[1:-1]
@@ -192,11 +214,11 @@ class Forces(ConstraintKind[ForceRow]):
         return {int(k) for k in (tops[:, None] + np.array([-1, 0, 1])).ravel()}
 
     def _other_branches(self, carry: PlacedCarry) -> list[ForceRow]:
-        """Return rows for branches other than that with tight friction cones, where one of them is,
-        or nearly is, the largest.
+        """Return force rows for all branches except the one with tight friction cones, at samples
+        where they are the largest or nearly so.
 
-        The list is empty for robust forces, and for forces that a convex program computes: they
-        have one row per robot and sample.
+        The list is empty for robust forces, and for forces that a convex program computes. Such
+        forces have one row per robot and sample.
         """
         if self.cell.robust is not None or self._main == PROGRAM_BRANCH:
             return []
@@ -210,23 +232,33 @@ class Forces(ConstraintKind[ForceRow]):
 
 
 class Pressure(ConstraintKind[PressureRow]):
-    """Rows that keep the centres of pressure within the patches.
+    """Rows (scalar inequalities) that keep the centres of pressure within the patches.
 
-    They lie where the shift of the centre of pressure is largest in a stretch of the path near the
-    rim, and beside it.
+    They lie at and beside the samples at which a centre of pressure near the rim is farthest from
+    the middle of its patch.
     """
 
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PressureRow]:
-        """Return rows at and beside each local maximum of a robot's pressure shift that exceeds the
-        share `PRESSURE_SHARE` of the patch radius."""
+        """Return rows at and beside each local maximum of a robot's pressure shift above the share
+        `PRESSURE_SHARE` of the patch radius.
+
+        Args:
+            carry: the candidate, evaluated at places of the path.
+            limits: not used.
+        """
         return self._beyond(carry, PRESSURE_SHARE)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PressureRow]:
-        """Return rows at and beside each local maximum of a pressure shift that reaches the rim.
+        """Return rows at and beside each local maximum of a pressure shift that reaches the rim of
+        the patch.
 
         Half of `PATCH_MARGIN` is left for rounding of the solver.
+
+        Args:
+            carry: candidate after the step.
+            known: candidate before the step; not used.
         """
         return self._beyond(carry, (1.0 - PATCH_MARGIN / 2.0) ** 0.5)
 
@@ -240,25 +272,42 @@ class Pressure(ConstraintKind[PressureRow]):
 
 
 class JointLimits(ConstraintKind[PathRow]):
-    """Rows that keep joints within their limits, at the local minima of the distance to a limit."""
+    """Rows (scalar inequalities) that keep joints within their limits, at the local minima of the
+    distance to a limit.
+    """
 
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows where a joint is closer to a limit than `JOINT_DISTANCE`."""
+        """Return rows where a joint is closer to a limit than `JOINT_DISTANCE`.
+
+        Args:
+            carry: the candidate, evaluated at places of the path.
+            limits: not used.
+        """
         return self._below(carry, JOINT_DISTANCE)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
         """Return rows where a joint is beyond a limit, or closer to it than half of
-        `SAMPLING_MARGIN`."""
+        `SAMPLING_MARGIN`.
+
+        Args:
+            carry: candidate after the step.
+            known: candidate before the step; not used.
+        """
         return self._below(carry, SAMPLING_MARGIN / 2.0)
 
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[PathRow], is_relaxed: bool = False
     ) -> list[float]:
-        """Return `SAMPLING_MARGIN` [rad] for every row.
+        """Return the required distance to the joint limit for every row: `SAMPLING_MARGIN` [rad].
 
-        This distance to the limit covers the path between places.
+        This distance covers the path between places.
+
+        Args:
+            carry: not used.
+            rows: the rows.
+            is_relaxed: not used.
         """
         return [SAMPLING_MARGIN] * len(rows)
 
@@ -276,7 +325,8 @@ class JointLimits(ConstraintKind[PathRow]):
 
 
 class ManipulabilityLimits(ConstraintKind[PathRow]):
-    """Rows that keep both arms away from singularities, by a least value of ``|det J|``.
+    """Rows (scalar inequalities) that keep both arms away from singularities, by a least value of
+    ``|det J|``.
 
     J is an arm's Jacobian. These rows also bound the reach: at its edge ``|det J|`` is zero, and
     beyond it nothing is defined.
@@ -285,11 +335,16 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows at regular distances along the stretches of the path with a low ``|det J|``.
+        """Return rows at regular distances along the stretches of the path with a low ``|det J|``
+        of an arm's Jacobian J.
 
         Low is below `MANIPULABILITY_SHARE` of the median along the path. Where ``|det J|`` is near
         its least allowed value, rows are closer together, so that the minimum does not move between
         two of them.
+
+        Args:
+            carry: the candidate, evaluated at places of the path.
+            limits: not used.
         """
         places = self.grid.places
         for arm in (0, 1):
@@ -301,10 +356,15 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
                 yield PathRow(ManipulabilityLimit(arm), place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return rows where ``|det J|`` is below its least allowed value plus half of the margin.
+        """Return rows where ``|det J|`` of an arm's Jacobian J is below its least allowed value
+        plus half of the margin.
 
-        If an arm does not reach all places, its rows at the first unreachable place and at two
-        later ones are returned too: there the arm is stretched out and so singular.
+        For an arm that does not reach all places, rows at the first unreachable place and at two
+        later ones are added: there the arm is stretched out and so singular.
+
+        Args:
+            carry: candidate after the step.
+            known: candidate before the step; not used.
         """
         least = (1.0 + SAMPLING_MARGIN / 2.0) ** 0.5
         for arm in (0, 1):
@@ -318,21 +378,31 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[PathRow], is_relaxed: bool = False
     ) -> list[float]:
-        """Return `SAMPLING_MARGIN` for every row.
+        """Return the required value of every row: `SAMPLING_MARGIN`.
 
-        The margin applies to the square of ``|det J|`` over its least allowed value, and covers the
-        path between places.
+        A row's value is the square of ``|det J|`` over its least allowed value, minus one. The
+        margin covers the path between places.
+
+        Args:
+            carry: not used.
+            rows: the rows.
+            is_relaxed: not used.
         """
         return [SAMPLING_MARGIN] * len(rows)
 
     def tightened_bounds(
         self, carry: PlacedCarry, known: PlacedCarry, rows: Sequence[PathRow], before: list[float]
     ) -> list[float]:
-        """Return for each row that a step violated the value that it has to exceed from now on.
+        """Return the new bound of each row (scalar inequality) that a step violated.
 
-        If an arm does not reach all places after the step, this is the mean of the row's last
-        required value and its value at the candidate before the step. Otherwise it is
-        `SAMPLING_MARGIN`.
+        The bound is `SAMPLING_MARGIN` if both arms reach all places after the step. Otherwise it is
+        the mean of the row's last bound and its value at the candidate before the step.
+
+        Args:
+            carry: candidate after the step.
+            known: candidate before the step.
+            rows: the violated rows.
+            before: last bound of each row.
         """
         if not carry.unreachable_arms:
             return self.required_values(carry, rows)
@@ -341,7 +411,7 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
 
 
 def smooth_values(cell: SmoothCell, carry: PlacedCarry, rows: Sequence[PathRow]) -> Array:
-    """Compute the values of rows by the smooth model at a candidate.
+    """Compute the values of rows (scalar inequalities) by the smooth model at a candidate.
 
     Args:
         cell: shared data of the polish.
