@@ -473,9 +473,7 @@ class ForceRun(PolishRun[ForceAttempt]):
         return len(self._archive.front_indices()) < self._settings.fill.members
 
     def _is_far(self, objectives: Array) -> bool:
-        """Return True if objectives (2,) lie beyond the front's ends, or in a gap wider than
-        `FAR_GAP`.
-        """
+        """Return True if objectives (2,) lie beyond the front's ends or in a gap over `FAR_GAP`."""
         f = [self._archive.objectives[k][0] for k in self._archive.front_indices()]
         place = int(np.searchsorted(f, objectives[0]))
         if place in (0, len(f)):

@@ -76,7 +76,13 @@ def write_bundle(
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """Read the manifest of a bundle and return its JSON values by name.
+    """Read the manifest of a bundle.
+
+    Args:
+        folder: folder of the bundle.
+
+    Returns:
+        JSON values by name.
 
     Raises:
         ResultsError: the manifest is missing, damaged, or was changed after writing.

@@ -172,7 +172,12 @@ def record_of(kind: type[Record], content: bytes, path: Path | str, remedy: str)
 
 
 def csv_text(header: Sequence[str], rows: Iterable[Sequence[str | float]]) -> str:
-    """Format a header and rows as CSV text; numbers keep their exact value."""
+    """Format a table as CSV text; numbers keep their exact value.
+
+    Args:
+        header: name of each column.
+        rows: values of each row.
+    """
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([header, *rows])
     return text.getvalue()
@@ -256,6 +261,9 @@ def sha256(content: bytes) -> str:
 def locked(folder: Path) -> Iterator[None]:
     """Lock a results folder for this process within a `with` block; the end of the process also
     releases it.
+
+    Args:
+        folder: the results folder.
 
     Raises:
         ResultsError: another process holds the lock, or the folder cannot be written.

@@ -81,7 +81,10 @@ class StoredTrajectory:
         return found or PAPER_OBJECTIVES
 
     def open_cell(self, folder: Path) -> Cell:
-        """Write the workcell's files to a folder and return the cell with the stored objectives.
+        """Write the workcell's files to a folder, and return the cell with the stored objectives.
+
+        Args:
+            folder: folder for the files.
 
         Raises:
             ResultsError: the stored workcell is not valid, or does not fit the decision vector.
@@ -89,7 +92,10 @@ class StoredTrajectory:
         return Cell(self.unpack(folder), self.objectives)
 
     def unpack(self, folder: Path) -> Workcell:
-        """Write the workcell's files to a folder and return the workcell read from them.
+        """Write the workcell's files to a folder, and return the workcell read from them.
+
+        Args:
+            folder: folder for the files.
 
         Raises:
             ResultsError: the stored workcell is not valid, or does not fit the decision vector.
@@ -157,10 +163,13 @@ def write_trajectory(
 
 
 def _standing_still(workcell: Workcell) -> tuple[Array, ...]:
-    """Return the inputs of the candidate function that follow x.
+    """Return the arguments of the candidate function that follow the decision vector x.
 
-    For drivable cells it is the timing of a carry at rest, because the start postures do not depend
-    on the timing.
+    For drivable cells they are times (n,) [s], path speeds (n,) and path accelerations (n,) of a
+    carry at rest, because the start postures do not depend on the timing. Other cells have none.
+
+    Args:
+        workcell: the cell.
     """
     if not workcell.task.law.is_drivable:
         return ()
@@ -170,6 +179,9 @@ def _standing_still(workcell: Workcell) -> tuple[Array, ...]:
 
 def read_trajectory(path: str | Path) -> StoredTrajectory:
     """Read and check a trajectory file.
+
+    Args:
+        path: path of the file.
 
     Raises:
         ResultsError: the file cannot be read, or a field is wrong.

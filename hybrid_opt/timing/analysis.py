@@ -110,6 +110,10 @@ def _jump(model: TimingModel, carry: Carry) -> Place | None:
 
     The place names the joint that is fastest there, relative to its speed limit. None if all joints
     start and end at rest.
+
+    Args:
+        model: timing model of the workcell.
+        carry: the carry.
     """
     limit = model.workcell.stack_joint_limits("velocity_max")
     ends = np.abs(carry.stack_arms("q_rate")[[0, -1]]) / limit
@@ -201,8 +205,13 @@ def duration_against_force_limit(
 
 
 def _peak_force(model: TimingModel, carry: Carry) -> float:
-    """Return the largest normal force of a carry [N]; the largest robust force if the model is
-    robust."""
+    """Return the largest normal force of a carry [N]: the robust force if the model is robust, else
+    the planned one.
+
+    Args:
+        model: timing model of the workcell.
+        carry: the carry.
+    """
     return float(model.carry_limits.limited_force(carry, model.drive_limits(1.0)).max())
 
 
@@ -240,7 +249,7 @@ def time_trajectory(
     own: TimingModel | None = None,
     progress: ShowProgress = False,
 ) -> TimedTrajectory:
-    """Time one decision vector in every way that the workcell's time law offers.
+    """Compute all timings of one decision vector that apply to the workcell's time law.
 
     Args:
         model: timing model of the drivable workcell.
@@ -248,7 +257,8 @@ def time_trajectory(
         force_limit: normal force [N] for one more timing within this limit; None for no such
             timing.
         curve_points: points of the curve of duration against force limit; None for no curve.
-        own: timing model of the workcell in which the search found x; None if it is `model`.
+        own: timing model of the workcell in which the search found x, if that has another time law;
+            None if it is `model`.
         progress: True for a progress bar, or a function of the finished and the total number of
             timings. The margins count as one timing.
 
@@ -397,6 +407,9 @@ def timing_document(timed: TimedTrajectory) -> TimingDocument:
 
 def read_timing(path: Path) -> TimingDocument:
     """Read one file of `timing/` in a results folder.
+
+    Args:
+        path: path of the file.
 
     Raises:
         ResultsError: the file is missing or damaged.

@@ -118,18 +118,18 @@ def time_with_jerk(
 
 
 def applicable_jerk_limits(workcell: Workcell, limits: TimingLimits) -> JerkLimits | None:
-    """Return the workcell's jerk limits if timings within `limits` can be computed with them.
-
-    None if the workcell has no jerk limits, or if `limits` bound robust forces of a contact model
-    without derivatives of these.
+    """Return the workcell's jerk limits if a timing within further `limits` can respect them. None
+    if the workcell has no jerk limits, or if `limits` bound robust forces whose derivatives the
+    contact model does not give.
     """
     slopes = command_model(workcell).has_scalar_squeeze or not limits.robust
     return JerkLimits.from_workcell(workcell) if slopes else None
 
 
 class _JerkProblem:
-    """Timing of one path within one set of limits, with k spline coefficients c of v as
-    variables."""
+    """Timing of one path within one set of limits. Its variables are the k spline coefficients c of
+    the squared speed v along the path, as in `WarpedPath`.
+    """
 
     def __init__(
         self, model: TimingModel, motion: PathMotion, limits: TimingLimits, jerk: JerkLimits
@@ -142,8 +142,8 @@ class _JerkProblem:
         )
 
     def solve(self) -> JerkTiming:
-        """Solve programs until the duration settles, then check the result between the coarse
-        points.
+        """Solve quadratic programs until the duration settles, then check the result between the
+        coarse points.
 
         Where the result exceeds a limit there, the limits of the neighbouring coarse points are
         tightened and the programs solved again, a few times at most.
@@ -200,7 +200,7 @@ class _JerkProblem:
         return np.asarray(c + share * (answer - c))
 
     def _motion_rows(self, rows: JerkProgram) -> None:
-        """Add limits on speeds and accelerations of joints and box."""
+        """Add limits on speeds and accelerations of joints and box to the program `rows`."""
         at, first_basis = self._coarse, self._coarse.first_basis
         squared_by, acceleration_by = at.local(at.squared_by), at.local(at.acceleration_by)
         most = squared_speed_limit(self._model, at.motion, self._limits)
@@ -216,8 +216,9 @@ class _JerkProblem:
             rows.add_norm_bounds(A / limit, np.zeros((len(at.s), 3)), none, at.keep, first_basis)
 
     def _force_rows(self, c: Array, rows: JerkProgram) -> None:
-        """Add limits on normal forces, joint torques and shifts of the pressure, linearised at c
-        (k,)."""
+        """Add limits on normal forces, joint torques and shifts of the pressure, linearised at the
+        coefficients c (k,), to the program `rows`.
+        """
         at = self._coarse
         a, w = at.acceleration_by @ c, np.maximum(at.squared_by @ c, 0.0)
         along = np.stack([at.acceleration_by, at.squared_by], axis=1)[:, None]
@@ -233,10 +234,10 @@ class _JerkProblem:
             _add_linearised(at, c, sign * value[:, near], sign * by, rows)
 
     def _jerk_rows(self, c: Array, rows: JerkProgram) -> None:
-        """Add limits on the jerks of joints and payload.
+        """Add limits on the jerks of joints and payload to the program `rows`.
 
-        Each bounds jerk / sqrt(v), which is linear in the coefficients, by the tangent of limit /
-        sqrt(v) at the coefficients c (k,).
+        The quantity jerk / sqrt(v) is linear in the coefficients, with the squared speed v. It is
+        bounded by the tangent of limit / sqrt(v) at the coefficients c (k,).
         """
         at, jerk, v = self._coarse, self._jerk, self._coarse.value @ c
         # Multiplied by sqrt(v) of the last round, so that rows are of order one.
@@ -262,8 +263,9 @@ class _JerkProblem:
         return np.asarray(np.maximum(np.append(use[0], between), np.append(between, use[-1])))
 
     def _start_factor(self, c: Array) -> float:
-        """Return a factor on coefficients c (k,) with which the motion is so slow that all limits
-        are little used."""
+        """Return a factor on coefficients c (k,) that makes the motion so slow that it uses little
+        of every limit.
+        """
         factor = 1.0
         rest = max(self._check(self._coarse, 0.0 * c)[1:])
         allowed = rest + START_UTILISATION * (1.0 - rest)
@@ -343,8 +345,9 @@ class WarpedPath:
 
     @classmethod
     def from_motion(cls, motion: PathMotion, intervals: int) -> WarpedPath:
-        """Sample a path at the ends of `intervals` equal intervals of s, both ends of the path
-        included."""
+        """Sample the path of `motion` at the ends of `intervals` equal intervals of its warped
+        parameter s, both ends of the path included.
+        """
         s, inner = np.linspace(0.0, 1.0, intervals + 1), np.linspace(0.0, 1.0, SPLINE_PIECES + 1)
         knots = np.concatenate([np.zeros(3), inner, np.ones(3)])
         splines = BSpline(knots, np.eye(len(knots) - 4), 3)
@@ -424,8 +427,9 @@ class WarpedPath:
         return root * (self.joint_jerk_by * own).sum(-1), root * (self.box_jerk_by * own).sum(-1)
 
     def objective(self, c: Array) -> tuple[Array, Array]:
-        """Return gradient (k,) and Hessian (k, k) of the duration by the coefficients, at c
-        (k,)."""
+        """Return gradient (k,) and Hessian (k, k) of the duration by the coefficients, at the
+        values c (k,).
+        """
         v, weights = self.value @ c, self._weights()
         gradient = -0.5 * self.value.T @ (weights * v**-1.5)
         return gradient, 0.75 * (self.value.T * (weights * v**-2.5)) @ self.value
@@ -508,8 +512,9 @@ class JerkProgram:
         return stacked, np.concatenate(b), cones, np.concatenate(cone_b)
 
     def used(self, c: Array, share: float) -> tuple[Mask, Mask]:
-        """Mark the linear rows and the cones of which coefficients c (k,) use more than `share` of
-        the bound."""
+        """Mark the linear rows (n_linear,) and the cones (n_cones,) of which coefficients c (k,)
+        use more than `share` of the bound.
+        """
         A, b, cone_A, cone_b = self.rows
         inside = cone_b - (cone_A @ c).reshape(-1, 4)
         lengths = np.linalg.norm(inside[:, 1:], axis=1)
@@ -543,8 +548,9 @@ class JerkProgram:
     def _solve_subset(
         self, H: Array, g: Array, scale: Array, rows: Mask, cones: Mask
     ) -> Array | None:
-        """Minimise c^T H c / 2 + g . c subject to the marked rows and cones only; None if the
-        solver fails. The solver's variables are c / `scale`, with sizes (k,) of the coefficients.
+        """Minimise c^T H c / 2 + g . c over coefficients c (k,), subject only to the rows and cones
+        that are marked True; None if the solver fails. `scale` (k,) holds typical sizes of the
+        coefficients; the solver's variables are c / scale.
         """
         # Not imported at the top: only jerk limits need it.
         import clarabel

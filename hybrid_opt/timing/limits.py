@@ -163,7 +163,13 @@ def squared_speed_limit(model: TimingModel, motion: PathMotion, limits: TimingLi
 
 def duration_at_speed_limits(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> float:
     """Compute the duration [s] of a path that is driven at its speed limits throughout, without
-    limits on accelerations."""
+    limits on accelerations.
+
+    Args:
+        model: timing model of the workcell.
+        motion: geometry of the path.
+        limits: limits in addition to the workcell's, such as the reference speeds.
+    """
     squared = squared_speed_limit(model, motion, limits)
     slowness = 1.0 / np.sqrt(np.minimum(squared, 1e8))
     return float(np.trapezoid(slowness, motion.parameter))

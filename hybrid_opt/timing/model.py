@@ -106,15 +106,20 @@ class PathMotion:
 
     def third_derivatives(self, u: Array) -> tuple[Array, Array]:
         """Return the third derivatives of the joint positions (m, all joints) and of the box
-        position (m, 3) by the path parameter, at path parameters u (m,)."""
+        position (m, 3) by the path parameter u.
+
+        Args:
+            u: (m,) path parameters in [0, 1].
+        """
         joints = self.q_second.shape[1]
         both = self._third(u)
         return both[:, :joints], both[:, joints : joints + 3]
 
     @cached_property
     def _spline(self) -> tuple[CubicSpline, Array]:
-        """One spline through all quantities side by side, and the first column of each quantity but
-        the first."""
+        """Cubic spline through all quantities side by side, and the index of the first column of
+        each quantity except the first.
+        """
         u = self.parameter[::_SPLINE_EVERY]
         columns = [
             getattr(self, name)[::_SPLINE_EVERY].reshape(len(u), -1) for name in SAMPLED_FIELDS
@@ -156,14 +161,16 @@ class CarryLimits:
         self._friction = np.array([contact.friction for contact in workcell.contacts])
 
     def applies(self, limit: Limit, limits: TimingLimits) -> bool:
-        """Return True if an entry of the table `symbolic.limits.LIMITS` applies to timings with the
-        options `limits`."""
+        """Return True if an entry `limit` of the table `symbolic.limits.LIMITS` applies to timings
+        with the options in `limits`.
+        """
         if limit.option == "pressure":
             return limits.pressure and self.has_pressure_limit
         return not limit.option or bool(getattr(limits, limit.option))
 
     def ratios(self, carry: Carry, limits: TimingLimits) -> dict[str, Array]:
-        """Compute every limited quantity over its limit at n samples of a carry.
+        """Compute every limited quantity over its limit at n samples of a carry. `limits` are those
+        in addition to the workcell's.
 
         Returns:
             Ratios by name: friction, and each limit of `symbolic.limits.LIMITS` that applies.
@@ -195,8 +202,9 @@ class CarryLimits:
         return ratios
 
     def limited_force(self, carry: Carry, limits: TimingLimits) -> Array:
-        """Return the normal forces (n, 2) [N] to which the force limit applies: planned forces; if
-        robust forces are limited, the larger ones of planned and robust forces."""
+        """Return the normal forces (n, 2) [N] of a carry to which the force limit applies: planned
+        forces, or if `limits` bound robust forces the larger ones of planned and robust forces.
+        """
         if not limits.robust:
             return carry.normal_force
         workcell = self.workcell
@@ -204,10 +212,9 @@ class CarryLimits:
         return np.maximum(carry.normal_force, np.stack([leading, commanded], axis=1))
 
     def _near_limit(self, carry: Carry, limits: TimingLimits) -> Array:
-        """Compute `limited_force` (n, 2) [N], exactly only for forces near the limit or the largest
-        force.
-
-        Elsewhere robust forces are replaced by planned ones. This takes a fraction of the time.
+        """Return `limited_force` (n, 2) [N] of a carry, exactly only for forces near the limit or
+        the largest force. Elsewhere planned forces replace robust ones, which takes a fraction of
+        the time.
         """
         if not limits.robust or limits.force is None:
             return self.limited_force(carry, limits)
@@ -235,8 +242,8 @@ def _bound_of(limit: Limit, workcell: Workcell) -> Array:
 def _robust_forces_above(
     level: float, points: PathPoints, path: RobustPath, found: Array, every: int = 1
 ) -> bool:
-    """Raise the entries of `found` (n, 2) [N] to those robust forces at n points that exceed a
-    level [N]. Only every `every`-th point is looked at.
+    """Raise entries of `found` (n, 2) [N] to the robust forces of `path` at n points, where these
+    exceed a level [N]. Only every point with an index divisible by `every` is evaluated.
 
     Returns:
         True if any robust force exceeds the level.
@@ -260,7 +267,7 @@ def row_lengths(vectors: Array) -> Array:
 
 
 class TimingModel:
-    """Everything that timings of one workcell's trajectories are computed from.
+    """Limits and compiled functions from which timings of one workcell's trajectories are computed.
 
     Attributes:
         workcell: the workcell.
@@ -374,8 +381,10 @@ class TimingModel:
     def uncertain_load(
         self, carry: Carry, friction: Array, centre_of_mass: Array
     ) -> dict[str, Array]:
-        """Compute the outputs `symbolic.contact.load.LOAD_OUTPUTS` of a carry with changed friction
-        coefficients (2,) and a changed centre of mass (3,) in the box frame [m]."""
+        """Compute the outputs `symbolic.contact.load.LOAD_OUTPUTS` (forces and wrenches by name) of
+        a carry with changed friction coefficients (2,) and a changed centre of mass (3,) in the box
+        frame [m].
+        """
         return self._functions["uncertain_load"].batch(
             carry.pose, carry.rate, carry.second_rate, friction, centre_of_mass
         )
@@ -412,9 +421,10 @@ class TimingModel:
         return np.concatenate(matrices, axis=1)
 
     def drive(self, motion: PathMotion, speed: Array, acceleration: Array) -> dict[str, Array]:
-        """Compute the outputs `symbolic.contact.load.LOAD_OUTPUTS` of a path that is driven with u'
-        (n,) [1/s] and u'' (n,) [1/s^2]. Joint torques are not among them; `contact_torque` computes
-        these."""
+        """Compute the outputs `symbolic.contact.load.LOAD_OUTPUTS` (forces and wrenches by name) of
+        the path `motion` that is driven with path speed u' (n,) [1/s] and path acceleration u''
+        (n,) [1/s^2].
+        """
         rate = motion.pose_first * speed[:, None]
         second = motion.pose_second * speed[:, None] ** 2 + (
             motion.pose_first * acceleration[:, None]
@@ -422,8 +432,9 @@ class TimingModel:
         return self.load(motion.pose, rate, second)
 
     def contact_torque(self, wrench_torque: Array, load: Mapping[str, Array]) -> Array:
-        """Compute the joint torques (n, all joints) [N m] that exert the contact wrenches among the
-        outputs `load`, with the matrices (n, all joints, 6) of `wrench_torque`."""
+        """Compute the joint torques (n, all joints) [N m] that exert the contact wrenches in
+        `load`, the outputs of `load`, with the matrices (n, all joints, 6) `wrench_torque`.
+        """
         wrenches = (load["wrench_1"], load["wrench_2"])
         return contact_torque(len(self.joint_names[0]), wrench_torque, wrenches)
 
@@ -531,18 +542,17 @@ class SpeedProfile:
     def carry(
         self, model: TimingModel, motion: PathMotion, a: float = 0.0, w: float = 0.0
     ) -> Carry:
-        """Return the carry that drives a path at these speeds.
-
-        The numbers `a` and `w` are added to every u'' and every u'^2 [1/s^2].
+        """Return the carry that drives the path `motion` at these speeds. The numbers `a` and `w`
+        [1/s^2] are added to every path acceleration u'' and to every squared path speed u'^2.
         """
         speed = np.sqrt(np.maximum(self.w + w, 0.0))
         return model.carry(motion.at(self.index), self.time, speed, self.a + a)
 
 
 def sample_limits_set(compiled: CompiledCell, lanes: int) -> NumericFunction:
-    """Load or build the compiled function `symbolic.limit_coefficients.sample_limits_function`.
-
-    It evaluates `lanes` samples side by side; 0 is the machine's width.
+    """Load or build the compiled function `symbolic.limit_coefficients.sample_limits_function` of a
+    cell, for `lanes` samples that one vector instruction evaluates side by side; 0 for the
+    machine's width.
     """
 
     def make(model: CellModel) -> dict[str, ca.Function]:

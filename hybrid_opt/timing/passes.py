@@ -58,7 +58,8 @@ larger one."""
 
 
 class ForwardBackwardPasses:
-    """The compiled passes of one workcell, which time batches of paths.
+    """The compiled backward and forward pass of one workcell, which computes the fastest timings of
+    batches of paths.
 
     Attributes:
         workcell: the workcell.
@@ -176,7 +177,7 @@ class RobustCuttingPlanes:
         paths: Mapping[str, Array],
         options: Array,
     ) -> None:
-        """Start without supporting lines.
+        """Start without supporting lines (tangents that bound the robust forces).
 
         Args:
             passes: `forward_backward_passes` with `CUTS_PER_SAMPLE`.
@@ -436,7 +437,7 @@ def limit_place(
     sample: int,
     parameter: float,
 ) -> Place:
-    """Describe the place at which a limit is used most.
+    """Describe the place on a path at which a limit is used most.
 
     Args:
         workcell: the workcell.

@@ -123,7 +123,7 @@ class PathTimer:
         return timing
 
     def path_errors(self, paths: dict[str, Array]) -> list[PathTiming | None]:
-        """Return for each path the error that excludes any timing, else None.
+        """Return for each path the error because of which no timing exists, None without an error.
 
         Errors are: no motion, an arm that loses the path, joint limits, and manipulability.
 
@@ -186,7 +186,13 @@ class PathTimer:
 
 
 def _as_path_timing(model: TimingModel, x: Array, limits: TimingLimits) -> PathTiming:
-    """Time a path (n_path,) by `time_path` and convert the result to a `PathTiming`."""
+    """Time a path by `time_path` and convert the result to a `PathTiming`.
+
+    Args:
+        model: timing model of the workcell.
+        x: (n_path,) free waypoints.
+        limits: limits in addition to the workcell's.
+    """
     timing = time_path(model, x, limits)
     force, robust, carry = np.full(2, np.nan), None, timing.carry
     if timing.status is TimingStatus.INFEASIBLE_AT_REST:
@@ -258,17 +264,29 @@ class CandidateDriver:
         self._last: tuple[bytes, TimedCandidate] | None = None
 
     def limits(self, force: float) -> TimingLimits:
-        """Return the timing limits of a candidate with this force limit [N]."""
+        """Return the timing limits of a candidate with a force limit.
+
+        Args:
+            force: the force limit [N].
+        """
         return TimingLimits(force=max(force, LEAST_FORCE_LIMIT), robust=self.robust)
 
     def time_paths(self, paths: Array, force: Array) -> list[PathTiming]:
-        """Compute the fastest timings of paths (n, n_path) within force limits (n,) [N]."""
+        """Compute the fastest timings of n paths, each within its own force limit.
+
+        Args:
+            paths: (n, n_path) free waypoints.
+            force: (n,) force limits [N].
+        """
         return self.timer.time_all(paths, self._limits, np.maximum(force, LEAST_FORCE_LIMIT))
 
     def durations(self, paths: Array, force: float) -> Array:
-        """Compute the durations (n,) [s] of paths (n, n_path) within one force limit [N].
+        """Compute the durations (n,) [s] of the fastest timings of n paths within one force limit;
+        infinite for a path without a timing.
 
-        A path without a timing has an infinite duration.
+        Args:
+            paths: (n, n_path) free waypoints.
+            force: the force limit [N].
         """
         found = self.time_paths(paths, np.full(len(paths), force))
         return np.array([t.duration if t.status is TimingStatus.OK else np.inf for t in found])
@@ -322,9 +340,12 @@ class CandidateDriver:
         return outputs | {"drive_violation": violation, "drive_position": position}
 
     def time_candidate(self, x: Array) -> TimedCandidate:
-        """Compute the fastest timing of a decision vector x (n_var,) within its own force limit.
+        """Compute the fastest timing of a candidate within its own force limit.
 
         The last result is cached, because a polish asks for it several times in a row.
+
+        Args:
+            x: (n_var,) decision vector.
         """
         key = x.tobytes()
         if self._last is None or self._last[0] != key:
@@ -339,11 +360,17 @@ class CandidateDriver:
 
 
 def _speed_profile_at(timing: PathTiming, u: Array) -> tuple[Array, Array, Array]:
-    """Compute time [s], path speed u' [1/s] and path acceleration u'' [1/s^2] at path parameters u
-    (n,), each (n,).
+    """Compute the motion along a path at given path parameters.
 
     At a grid point u'' belongs to the interval that begins there. A path without a timing is at
     rest.
+
+    Args:
+        timing: fastest timing of the path.
+        u: (n,) path parameters in [0, 1].
+
+    Returns:
+        Time [s], path speed u' [1/s] and path acceleration u'' [1/s^2], (n,) each.
     """
     if not np.isfinite(timing.duration):
         return u, np.zeros_like(u), np.zeros_like(u)

@@ -24,7 +24,7 @@ PER_ROBOT = (FRICTION_RATIO, *(limit.name for limit in LIMITS if limit.scope == 
 
 
 class TimingStatus(StrEnum):
-    """Outcome of timing a path."""
+    """Outcome of the computation of a path's timing."""
 
     OK = "ok"
     EXCEEDED = "limits exceeded"

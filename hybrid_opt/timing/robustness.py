@@ -64,8 +64,12 @@ class PayloadSensitivity:
         return float(self.mass_by_resultant.min())
 
     def force_at(self, masses: Array) -> Array:
-        """Return the largest total contact forces (n, 2) [N] of both robots at payload masses (n,)
-        [kg]."""
+        """Return the largest total contact forces (n, 2) [N] of both robots at other payload
+        masses.
+
+        Args:
+            masses: (n,) payload masses [kg].
+        """
         forces: Array = np.asarray(masses)[:, None] / self.mass * self.resultant
         return forces
 
@@ -92,7 +96,7 @@ class Margin:
 
 
 def payload_sensitivity(carry: Carry) -> PayloadSensitivity:
-    """Return the contact forces of a carry against payload mass, at unchanged timing."""
+    """Return how the contact forces of a carry depend on the payload mass, at unchanged timing."""
     cell = carry.workcell
     limited = limited_force(cell, carry.peak_normal_force, carry.peak_resultant_force)
     return PayloadSensitivity(cell.payload.mass, limited, mass_at_reference(cell, limited))
@@ -102,14 +106,17 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
     """Compute the largest errors of friction, centre of mass and patch size that a carry tolerates.
 
     Motion and timing stay the same. For each changed value the forces are computed anew, so the
-    robots squeeze as hard as necessary. The carry fails if a normal force exceeds its reference
-    force, a centre of pressure leaves its patch, or a joint torque exceeds its maximum. For a pad
-    with uniform pressure the result has no patch size, but how far the centre of pressure may shift
-    until the pad's rim lifts off.
+    robots press as hard as necessary. The carry fails if a normal force exceeds its reference
+    force, a centre of pressure leaves its patch, or a joint torque exceeds its maximum. For elastic
+    pads the result has no patch size. It states how far the centre of pressure may shift until the
+    pad's rim lifts off.
 
     Args:
         model: timing model of the workcell.
         carry: the carry.
+
+        Returns:
+            One margin for each changed assumption.
     """
     workcell = model.workcell
     payload, contacts, task = workcell.payload, workcell.contacts, workcell.task
@@ -121,8 +128,13 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
     has_patches = model.carry_limits.has_pressure_limit
 
     def failure(friction: Array, centre: Array) -> str:
-        """Return the name of the most exceeded limit with friction coefficients (2,) and a centre
-        of mass (3,) in the box frame [m]; '' if no limit is exceeded."""
+        """Return the name of the limit that is exceeded most in a cell with other friction and
+        centre of mass; '' if none is exceeded.
+
+        Args:
+            friction: (2,) friction coefficients.
+            centre: (3,) centre of mass in the box frame [m].
+        """
         load = model.uncertain_load(carry, friction, centre)
         torque = model.contact_torque(wrench_torque, load) + own_torque
         use = {
@@ -137,8 +149,13 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
         return "" if use[name] <= 1.0 else name
 
     def lowered(whose: str, which: Array) -> Margin:
-        """Return the margin of the friction at the contacts marked by 1 in `which` (2,), lowered by
-        one share, with the contacts' name `whose`."""
+        """Return the margin of the friction at some contacts, whose coefficients are lowered by one
+        common share.
+
+        Args:
+            whose: name of these contacts, for the margin.
+            which: (2,) 1 for these contacts, else 0.
+        """
         nominal = float(friction[which > 0.0].min())
         lost, fails = _largest_feasible_change(
             lambda lost: failure(friction * (1.0 - lost * which), centre),
@@ -147,8 +164,13 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
         return Margin(f"friction of {whose}", "", nominal, nominal * (1.0 - lost), fails)
 
     def shifted(axis: int, sign: float) -> Margin:
-        """Return the margin of the centre of mass along box axis 0, 1 or 2 in the direction of
-        `sign`, at most to the box's face."""
+        """Return the margin of the centre of mass along one axis of the box, at most to the box's
+        face.
+
+        Args:
+            axis: index of the axis: 0, 1 or 2.
+            sign: 1 or -1, the direction along the axis.
+        """
         nominal, direction = float(centre[axis]), sign * np.eye(3)[axis]
         offset, fails = _largest_feasible_change(
             lambda offset: failure(friction, centre + offset * direction),
@@ -176,7 +198,12 @@ def _even_margins(model: TimingModel, carry: Carry) -> list[Margin]:
     """Compute for each elastic pad how far its centre of pressure may shift further until a rim
     lifts off [m].
 
-    The shift starts from the largest one of the carry. Other contact models give an empty list.
+    The shift starts from the largest one of the carry. Contact models without elastic pads give an
+    empty list.
+
+    Args:
+        model: timing model of the workcell.
+        carry: the carry.
     """
     workcell = model.workcell
     if not contact_model(workcell).has_elastic_layers:
@@ -243,9 +270,8 @@ DIFFERENCE_STEP = 1e-6
 
 
 class TimingSensitivity:
-    """Linear program of the timings near the fastest timing of a path.
-
-    It tells how the shortest duration changes with parameters of the workcell.
+    """Linear program of the timings near the fastest timing of a path. It tells how parameters of
+    the workcell change the shortest duration.
 
     Attributes:
         speeds: path speeds of the fastest timing.
@@ -324,8 +350,12 @@ class TimingSensitivity:
         return np.concatenate([ratios[name][places] for name, places in self._used.items()])
 
     def _least_change(self, left: Array) -> float:
-        """Return the smallest change of the duration [s] (negative if it falls) that the slacks
-        `left` (m,) of m limits allow; NaN if none is possible."""
+        """Return the smallest change of the duration [s], negative if it falls, that the limits
+        allow; NaN if no timing satisfies them.
+
+        Args:
+            left: (m,) slack of each of m limits.
+        """
         found = linprog(
             self._slope,
             A_ub=self._matrix,

@@ -77,6 +77,11 @@ def _error_at_rest(model: TimingModel, motion: PathMotion, limits: TimingLimits)
     """Return the error of a path on which the box at rest exceeds a limit somewhere, else None.
 
     Without an error a timing exists: in a slow motion every quantity is close to its value at rest.
+
+    Args:
+        model: timing model of the workcell.
+        motion: geometry of the path.
+        limits: limits in addition to the workcell's.
     """
     timing = check_limits(model, model.still(motion), limits)
     used = most_used(timing.use)
@@ -178,7 +183,12 @@ def _slow_down(
 
 
 def path_error(model: TimingModel, motion: PathMotion) -> Timing | None:
-    """Return the error of a path on which nothing moves or an arm fails, else None."""
+    """Return the error of a path on which nothing moves or an arm fails, else None.
+
+    Args:
+        model: timing model of the workcell.
+        motion: geometry of the path.
+    """
     arms = motion.lost, motion.limit_margin, motion.manipulability
     failure = path_failure(model.workcell, motion.pose, *arms)
     if failure is None:
@@ -262,8 +272,11 @@ def largest_speed_factor(use: Callable[[float], float]) -> float:
 def most_used(use: dict[str, Utilisation]) -> Utilisation:
     """Return the largest of the utilisations.
 
-    That of friction is one by construction of the forces, so it counts only if friction is
-    exceeded.
+    The utilisation of friction is one by construction of the forces, so it counts only if friction
+    is exceeded.
+
+    Args:
+        use: largest utilisation by name of the limit.
     """
     candidates = [
         excess

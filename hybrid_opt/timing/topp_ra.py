@@ -86,7 +86,8 @@ def toppra_timing(
 
 
 class _CuttingPlaneProblem:
-    """The sequence of linear programs for one path and one set of limits.
+    """Sequence of linear programs that computes the fastest timing of one path within one set of
+    limits.
 
     `_tightened` (intervals,) divides the bounds of each interval; it is above one if a limit was
     exceeded between the points of the interval. `_near` marks the limits that are not convex and
@@ -111,10 +112,10 @@ class _CuttingPlaneProblem:
         self._duration = np.inf
 
     def _first_rows(self) -> Iterator[LinearLimits]:
-        """Yield the limits that are known before any timing is.
+        """Yield the linear limits of the first program.
 
-        These are the linear limits on speeds and joint accelerations, and first supporting lines of
-        the convex limits.
+        These are the limits on speeds and joint accelerations, and the first supporting lines
+        (tangents) of the convex limits.
         """
         limit = squared_speed_limit(self._model, self._at.motion, self._limits)
         limit = np.minimum(limit, SPEED_CEILING / self._scale**2)[:, None]
@@ -158,8 +159,14 @@ class _CuttingPlaneProblem:
         )
 
     def _interval_rows(self, rows: list[LinearLimits]) -> LinearLimits:
-        """Convert limits at the points of each interval to limits on u'' of the interval and u'^2
-        at its beginning, in the scaled path coordinate."""
+        """Convert limits at the points of each interval to limits of the interval, in the scaled
+        path coordinate.
+
+        A limit of an interval bounds its constant u'' and the u'^2 at its beginning.
+
+        Args:
+            rows: limits at all points.
+        """
         alpha, beta, bound = (
             np.concatenate([getattr(row, name) for row in rows], axis=1)
             for name in ("alpha", "beta", "bound")
@@ -288,7 +295,8 @@ class _CuttingPlaneProblem:
 
 
 def norm_rows(first: Array, second: Array, limit: float, directions: Array) -> LinearLimits:
-    """Return supporting lines of the limit on the length of first u'' + second u'^2.
+    """Return supporting lines (tangents) of the limit on the length of the vector first u'' +
+    second u'^2.
 
     Args:
         first, second: (n, 3) coefficient vectors at n points.
@@ -315,9 +323,9 @@ def tangent_rows(value: Array, gradient: Array, z: Array) -> LinearLimits:
 def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> LinearLimits:
     """Linearise k functions of (u'', u'^2) that may not exceed one, such that rest stays feasible.
 
-    They are linearised about z. A tangent that forbids rest is replaced: it keeps its slope by u'',
-    and by u'^2 it takes that of the chord from z to rest. Raising the tangent's bound in its place
-    would cut off nothing, not even z.
+    They are linearised about z. A tangent that forbids rest is changed: it keeps its slope by u'',
+    but its slope by u'^2 becomes that of the line from z to rest. If its bound were raised instead,
+    it would not even exclude z.
 
     Args:
         value: (n, k) values of the functions at z.
@@ -447,7 +455,9 @@ def _solve(rows: LinearLimits, grid: Array) -> Array | SolverFailure:
 
 @contextmanager
 def _quiet() -> Iterator[None]:
-    """Silence the log of toppra, whose failures are returned as `SolverFailure`."""
+    """Silence the log of the package toppra within a `with` block. Its failures are returned as
+    `SolverFailure`.
+    """
     logger = logging.getLogger("toppra")
     level = logger.level
     logger.setLevel(logging.CRITICAL + 1)
