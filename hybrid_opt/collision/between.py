@@ -186,10 +186,11 @@ class _Sweep:
         return Intervals(index, start, width, a, b, *self.checker.motion(*ends), pending)
 
     def _uncleared(self, work: Intervals) -> Intervals:
-        """Return the intervals in which a pair is not yet proven to keep the required distance.
+        """Return those of the given intervals in which a pair is not yet proven to keep the
+        required distance.
 
-        The proof is one of the two bounds in the description of this module. Pairs with a proof are
-        no longer `pending`.
+        The proof is one of the two bounds that the module's documentation describes. Pairs with a
+        proof are no longer `pending`.
         """
         c_a, c_b = work.a.clearance, work.b.clearance
         halfway = c_a + c_b
@@ -204,7 +205,7 @@ class _Sweep:
         return replace(work, pending=pending)[left]
 
     def _required(self, work: Intervals) -> Array:
-        """Return the distance that pairs have to keep in m intervals, (m, n_pairs) [m].
+        """Return the distance that each pair has to keep in each of m intervals, (m, n_pairs) [m].
 
         The shape is (1, n_pairs) if all intervals belong to one motion.
         """
@@ -253,7 +254,7 @@ class _Sweep:
         return self.checker.measure(*self.checker.split(end.configuration), end.clearance, wanted)
 
     def _halves(self, work: Intervals) -> Intervals:
-        """Return both halves of every interval, the earlier half first."""
+        """Return the two halves of every given interval, the earlier half first."""
         middle = (work.a.configuration + work.b.configuration) / 2.0
         clearance = self.checker.bounds(*self.checker.split(middle))
         new = End(middle, clearance, np.zeros(clearance.shape, dtype=bool))
@@ -274,7 +275,7 @@ class _Sweep:
 
 
 class Rows:
-    """A record of arrays with one row per item. A field may be such a record itself."""
+    """A record of arrays with one row per item. A field may be a record of this kind as well."""
 
     def __getitem__(self, rows: NDArray[np.bool_]) -> Self:
         return of_rows(lambda values: values[0][rows], [self])
@@ -348,5 +349,7 @@ class Intervals(Rows):
 
 
 def _alternating(values: list[Array]) -> Array:
-    """Interleave the rows of several arrays."""
+    """Interleave the rows of k arrays (m, ...): the first row of each, then the second of each.
+    Return (k m, ...).
+    """
     return np.stack(values, axis=1).reshape(-1, *values[0].shape[1:])

@@ -203,6 +203,12 @@ def _straight_grid(
     """Refine the grids of all paths as `certify_all` describes.
 
     An interval in whose middle an arm loses the path is not refined.
+
+    Args:
+        checker: collision checker of the workcell.
+        configurations: function from path indices (n,) and path parameters (n,) to configurations
+            (n, 6 + all joints).
+        parameters: for every path the increasing path parameters (n,) of its first grid.
     """
     owner = np.repeat(np.arange(len(parameters)), [len(u) for u in parameters])
     u = np.concatenate([np.asarray(grid, dtype=float) for grid in parameters])
@@ -238,7 +244,8 @@ def _straight_grid(
 
 
 def _farthest(checker: CollisionChecker, configuration: Array, other: Array) -> Array:
-    """Compute the largest chord of any pair between two configurations, (n,) [m].
+    """Compute a bound of the relative motion of the bodies of any pair between two configurations,
+    (n,) [m].
 
     Args:
         checker: collision checker of the workcell.
@@ -311,7 +318,7 @@ class SampledPath:
 def configurations(
     paths: Sequence[SampledPath], posture: NumericFunction, owner: NDArray[np.intp], u: Array
 ) -> Array:
-    """Compute box pose and joint positions anywhere on sampled paths.
+    """Compute box poses and joint positions at given places of sampled paths.
 
     Args:
         paths: sampled paths of one task.

@@ -77,7 +77,8 @@ class CollisionChecker:
         geometry: the workcell's bodies and pairs.
         distances: distance queries of these bodies.
         judge: FCL objects of these bodies.
-        functions: `symbolic.geometry.clearance.screening_functions`, compiled or interpreted.
+        functions: functions by name of `symbolic.geometry.clearance.screening_functions`, compiled
+            or interpreted.
         free_beyond: (n_pairs,) a pair is free if its lower bound exceeds this distance [m].
         resting_places: places at which the payload may rest on a body of the environment, one for
             each allowed contact and fixed pose that touches the body: index of the pair, box centre
@@ -95,8 +96,12 @@ class CollisionChecker:
         self.resting_places = self._find_resting()
 
     def split(self, configuration: Array) -> tuple[Array, Array, Array]:
-        """Split configurations (n, 6 + all joints) into box poses (n, 6) and both arms' joints
-        (n, joints), each contiguous."""
+        """Split configurations into box poses (n, 6) and the joints (n, joints) of the first and
+        the second arm, each contiguous.
+
+        Args:
+            configuration: (n, 6 + all joints) configurations.
+        """
         parts = np.split(configuration, self._parts, axis=1)
         first, second, third = map(np.ascontiguousarray, parts)
         return first, second, third
@@ -289,7 +294,9 @@ class CollisionChecker:
         return max(best, 0.0)
 
     def _still(self) -> tuple[Array, Array]:
-        """Return placeholder joints of both arms for one sample of which only the box matters."""
+        """Return placeholder joint positions (1, joints) of both arms, for computations that depend
+        on the box alone.
+        """
         first, second = (np.zeros((1, arm.joints)) for arm in self.geometry.arms)
         return first, second
 
@@ -298,7 +305,9 @@ class CollisionChecker:
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return the indices (m,) of the first and of the second body of each pair.
 
-        Where `resting` is True, the shrunk payload replaces the payload.
+        Args:
+            pairs: (m,) indices of active pairs.
+            resting: (m,) True where the shrunk payload replaces the payload.
         """
         first, second = self._pairs[pairs].T
         return np.where(resting, self.distances.shrunk_payload, first), second
@@ -342,8 +351,15 @@ class CollisionChecker:
     def _resting(
         self, pose: Array, rows: NDArray[np.intp], pairs: NDArray[np.intp]
     ) -> NDArray[np.bool_]:
-        """Return True for each query (m,) in which the box may rest on the other body of
-        the pair.
+        """Find the queries in which the box may rest on the other body of the pair.
+
+        Args:
+            pose: (n, 6) box poses [m, rad].
+            rows: (m,) index of the sample of each query.
+            pairs: (m,) index of the active pair of each query.
+
+        Returns:
+            (m,) True for these queries.
         """
         found = np.zeros(len(pairs), dtype=bool)
         for pair, place, departure in self.resting_places:

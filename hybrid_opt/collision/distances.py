@@ -133,7 +133,7 @@ class BodyDistances:
 def shape_table(
     shapes: Sequence[ConvexShape],
 ) -> tuple[NDArray[np.int64], Array, NDArray[np.int64], Array]:
-    """Return shapes as the four arrays that the C++ class `Bodies` takes first.
+    """Convert n shapes to the first four arguments of the C++ class `Bodies`.
 
     These are kinds (n,), sizes (n, 3) [m], numbers of corners (n,), and the corners (m, 3) of all
     hulls [m]; `distances.cpp` defines kinds and sizes.

@@ -109,6 +109,10 @@ def _in_root(body: CollisionBody, arm: ArmGeometry) -> tuple[Piece, ...]:
 
     This is the link's frame for a moving link, and the frame of the arm's root for a fixed body.
     The poses of a fixed body's pieces are rounded.
+
+    Args:
+        body: the body.
+        arm: the arm.
     """
     if body.frame != WORLD:
         return body.pieces
@@ -153,8 +157,18 @@ def _tabulate(given: CacheKey) -> NDArray[np.float32]:
 def _are_within_limits(
     cells: NDArray[np.intp], width: float, arm: ArmGeometry, joint: int
 ) -> NDArray[np.bool_]:
-    """Return True for each cell (n, 2) that holds positions within the joint limits, up to whole
-    turns."""
+    """Find the cells of a table that hold positions within the limits of two successive joints, up
+    to whole turns.
+
+    Args:
+        cells: (n, 2) indices of cells along both joints.
+        width: width of a cell [rad].
+        arm: the arm.
+        joint: index of the first joint.
+
+    Returns:
+        (n,) True for such cells.
+    """
     low, high = arm.lower[joint : joint + 2], arm.upper[joint : joint + 2]
     off = np.mod((cells + 0.5) * width - (low + high) / 2.0 + np.pi, 2.0 * np.pi) - np.pi
     return np.asarray(np.all(np.abs(off) <= (high - low + width) / 2.0, axis=1))

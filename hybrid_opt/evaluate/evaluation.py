@@ -76,8 +76,8 @@ class Evaluations:
         objectives: (n, m) values without penalty; meaningful only for feasible candidates.
         penalised: (n, m) objectives with the paper's penalty, always finite, for searches.
         feasible: (n,) True for feasible candidates.
-        reason: (n,) index into `REASONS` of the constraint violated first along the path, or
-            `FEASIBLE`.
+        reason: (n,) index into `REASONS` of the constraint that is violated first along the path;
+            `FEASIBLE` if there is none.
         position: (n,) path parameter in [0, 1] of the first violation; NaN if feasible.
         violation: (n, len(REASONS)) violation of each constraint, 0 if satisfied, in the unit of
             the constraint (`symbolic.functions.CONSTRAINTS`). For `collision` it is the share of
@@ -206,8 +206,8 @@ class CandidateEvaluator:
 
     @cached_property
     def _kernel(self) -> Kernel | None:
-        """The evaluation of several candidates side by side; None if the machine or the cell does
-        not support it.
+        """Compiled evaluation of several candidates side by side; None if the machine or the cell
+        does not support it.
         """
         return load_kernel(self.compiled, self.checker, self.outputs) if self._in_lanes else None
 
@@ -277,7 +277,10 @@ class CandidateEvaluator:
         return self._judge(x, sampled, sampled.outputs if self._needs else self._outputs(x))
 
     def carry(self, x: Array) -> Carry:
-        """Return the carry of one decision vector x (n_var,) under the task's time law.
+        """Return the carry of one decision vector under the task's time law.
+
+        Args:
+            x: (n_var,) decision vector.
 
         Raises:
             SettingsError: x has the wrong shape.
@@ -290,8 +293,10 @@ class CandidateEvaluator:
         return carry_from_outputs(self.workcell, self.functions, x[0], single, judgement)
 
     def certificate(self, x: Array) -> Certificate:
-        """Certify that the carry of one decision vector x (n_var,) is free of collisions along the
-        whole path.
+        """Certify that the carry of one decision vector is free of collisions along the whole path.
+
+        Args:
+            x: (n_var,) decision vector.
 
         Raises:
             LostPathError: an arm loses the path, on its samples or between them.
@@ -308,8 +313,10 @@ class CandidateEvaluator:
         return found
 
     def _paths(self, x: Array) -> list[SampledPath | None]:
-        """Return the sampled path of each decision vector x (n, n_var); None if an arm loses the
-        path.
+        """Return the sampled path of each decision vector, in order; None if an arm loses the path.
+
+        Args:
+            x: (n, n_var) decision vectors.
         """
         if self._kernel is None:
             outputs: Mapping[str, Array] = self.outputs(x)
@@ -357,9 +364,11 @@ class CandidateEvaluator:
         )
 
     def _failures_between_samples(self, x: Array) -> list[float | None]:
-        """Return the path parameter at which each carry's proof fails; None for a carry with proof.
+        """Return the path parameter at which the proof of each carry fails; None for a carry with
+        proof.
 
-        Results are cached by path, since several carries may differ only in their force limit.
+        The proof shows that the carry is free of collisions between its samples. Results are cached
+        by path, since several carries may differ only in their force limit.
 
         Args:
             x: (n, n_var) decision vectors.
@@ -460,9 +469,12 @@ def _failure(certificate: Certificate | None) -> float | None:
 
 
 def _needs(objectives: Sequence[Objective]) -> tuple[str, ...] | None:
-    """Return the names of the per-sample outputs that the objectives need from the kernel.
+    """Return the names of the per-sample outputs that objectives need from the compiled kernel.
 
     The result is None if an objective needs an output that the kernel lacks.
+
+    Args:
+        objectives: the objectives.
     """
     wanted: set[str] = set()
     for objective in objectives:
@@ -503,12 +515,17 @@ class LockedEvaluator:
         self.lower, self.upper = evaluator.lower[: self.n_var], evaluator.upper[: self.n_var]
 
     def evaluate(self, x: Array) -> Evaluations:
-        """Evaluate box paths x (n, n_var), the free waypoints of the box."""
+        """Evaluate box paths with the redundant joints locked.
+
+        Args:
+            x: (n, n_var) free waypoints of the box.
+        """
         return replace(self._evaluator.evaluate(self._whole(x)), x=x)
 
     def certified(self, evaluations: Evaluations) -> Evaluations:
-        """Return the evaluations with a feasible front proven free of collisions, as
-        `CandidateEvaluator.certified` does."""
+        """Return the evaluations after a check for collisions between the samples. Afterwards every
+        member of the feasible front is proven free of collisions.
+        """
         whole = replace(evaluations, x=self._whole(evaluations.x))
         return replace(self._evaluator.certified(whole), x=evaluations.x)
 

@@ -341,7 +341,12 @@ def load_kernel(
 
 
 def _same(found: SampledVerdicts, expected: SampledVerdicts) -> bool:
-    """Return True if two evaluations agree to the last bit, in every output that `found` has."""
+    """Return True if two evaluations agree to the last bit.
+
+    Args:
+        found: an evaluation, whose outputs are all compared.
+        expected: the other evaluation.
+    """
     pairs = [(values, expected.outputs[name]) for name, values in found.outputs.items()]
     pairs += [
         (getattr(found, name), getattr(expected, name))
@@ -405,7 +410,7 @@ def _definitions(geometry: CellGeometry) -> str:
 def _groups(compiled: CompiledCell) -> list[str]:
     """Return the names of the parameter groups that the kernel takes, in order.
 
-    These are all groups but the squeezes of commanded forces.
+    These are all groups except those for commanded forces (`SQUEEZES`).
     """
     from symbolic.parameters import SQUEEZES
 
@@ -473,8 +478,10 @@ class BatchData(ctypes.Structure):
 
 
 def _judge_data(checker: CollisionChecker) -> tuple[JudgeData, dict[str, NDArray[Any]]]:
-    """Return the pairs and margins of a cell for the kernel, and the arrays that they point into.
-    These arrays and the checker must stay alive as long as the kernel."""
+    """Return the pairs of bodies and the margins of a cell as the kernel's C structure, and by name
+    the arrays to which its pointers refer. These arrays and the checker must stay alive as long as
+    the kernel.
+    """
     geometry = checker.geometry
     tables = np.zeros(len(geometry.active), dtype=_TABLE)
     for table in checker.tables:

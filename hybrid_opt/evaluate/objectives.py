@@ -103,9 +103,14 @@ def _larger(forces: Evaluate) -> Evaluate:
 
 
 def _peak_forces(outputs: Outputs, workcell: Workcell) -> Array:
-    """Return the peak normal forces (n, 2) of both robots over their reference forces.
+    """Return the peak normal forces (n, 2) of n candidates and both robots, over the reference
+    forces.
 
-    The peaks are those of the whole path if the timing computes them, else those of the samples.
+    The peaks cover the whole path if the timing computes them, else only the samples.
+
+    Args:
+        outputs: outputs of the evaluator by name.
+        workcell: the cell.
     """
     known = outputs.get("peak_force")
     peaks = outputs["normal_force"].max(axis=1) if known is None else known
@@ -113,20 +118,37 @@ def _peak_forces(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _mean_force(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the time mean of both normal forces over the mean reference force, (n,)."""
+    """Compute the time mean (n,) of both normal forces over the mean reference force, for n
+    candidates.
+
+    Args:
+        outputs: outputs of the evaluator by name.
+        workcell: the cell.
+    """
     both, time = outputs["normal_force"].mean(axis=2), outputs["time"]
     mean = np.trapezoid(both, time, axis=1) / (time[:, -1] - time[:, 0])
     return np.asarray(mean / float(workcell.task.reference_force.mean()), dtype=float)
 
 
 def _duration(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the durations (n,) over `duration_unit`."""
+    """Compute the durations (n,) of n candidates over `duration_unit`.
+
+    Args:
+        outputs: outputs of the evaluator by name.
+        workcell: the cell.
+    """
     duration = outputs["time"][:, -1] / duration_unit(workcell)
     return np.asarray(duration, dtype=float)
 
 
 def _peak_torque_use(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the largest joint torque from the contact wrench over that joint's maximum, (n,)."""
+    """Compute for n candidates the largest joint torque from the contact wrench over the torque
+    limit of the joint, (n,).
+
+    Args:
+        outputs: outputs of the evaluator by name.
+        workcell: the cell.
+    """
     uses = [
         (np.abs(outputs[f"joint_torque_{i + 1}"]) / robot.torque_max).max(axis=(1, 2))
         for i, robot in enumerate(workcell.robots)
@@ -135,17 +157,25 @@ def _peak_torque_use(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _force_imbalance(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the largest difference of both normal forces over the mean reference force, (n,)."""
+    """Compute for n candidates the largest difference of both normal forces over the mean reference
+    force, (n,).
+
+    Args:
+        outputs: outputs of the evaluator by name.
+        workcell: the cell.
+    """
     forces = outputs["normal_force"]
     difference: Array = np.abs(forces[:, :, 0] - forces[:, :, 1]).max(axis=1)
     return difference / float(workcell.task.reference_force.mean())
 
 
 def _joint_length(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the length of both arms' path in joint space over the length of the joint ranges,
-    (n,).
+    """Compute for n candidates the Euclidean length of both arms' path in joint space over the
+    Euclidean length of the joint ranges, (n,).
 
-    Both lengths are Euclidean.
+    Args:
+        outputs: outputs of the evaluator by name.
+        workcell: the cell.
     """
     steps = [np.diff(outputs[name], axis=1) for name in _JOINTS]
     length = np.sqrt(sum((step**2).sum(axis=2) for step in steps)).sum(axis=1)
@@ -156,14 +186,18 @@ def _joint_length(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the largest used share of the friction if both pads press with the reference force,
-    (n,).
+    """Compute for n candidates the largest used share of the friction if both pads press with the
+    reference force, (n,).
 
-    The least normal forces use the friction fully, by construction. So the forces N_1 and N_2
-    are raised to the reference force, with their difference kept. The needed friction coefficient
-    is the sum of both tangential forces over N_1 + N_2; the result is its ratio to the smaller
-    coefficient. For hands that hold without a squeeze it is the tangential force of a hand over the
-    friction of its holding force.
+    The least normal forces use the friction fully, by construction. So the forces N_1 and N_2 are
+    raised to the reference force, with their difference kept. The needed friction coefficient is
+    the sum of both tangential forces over N_1 + N_2; the result is its ratio to the smaller
+    coefficient. For hands that hold without a squeeze the result is the tangential force of a hand
+    over the friction of its holding force.
+
+    Args:
+        outputs: outputs of the evaluator by name.
+        workcell: the cell.
     """
     # Not imported at the top: programs' options name objectives without CasADi.
     from symbolic.contact.registry import contact_model
@@ -180,10 +214,14 @@ def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _robust_forces(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the peak robust force (n, 2) of each arm over its reference force.
+    """Compute for n candidates the peak robust force (n, 2) of each arm over its reference force.
 
-    Arm 1 leads; arm 2 presses with the commanded force (`hybrid_opt.robust`). The peaks are those
-    of the whole path if the timing limits robust forces, else those of the samples.
+    Arm 1 is position-controlled; arm 2 presses with the commanded force (`hybrid_opt.robust`). The
+    peaks cover the whole path if the timing limits robust forces, else only the samples.
+
+    Args:
+        outputs: outputs of the evaluator by name.
+        workcell: the cell.
     """
     if "robust_force" in outputs:
         return np.asarray(outputs["robust_force"] / workcell.task.reference_force)

@@ -126,8 +126,7 @@ class Guarded(Algorithm):  # type: ignore[misc]
 
 
 class WarmSampling(FloatRandomSampling):  # type: ignore[misc]
-    """Initial population of uniform samples within the bounds, of which the first are replaced by
-    given points."""
+    """Sampler of an initial population: given points, then uniform samples within the bounds."""
 
     def __init__(self, initial: Array | None = None) -> None:
         super().__init__()

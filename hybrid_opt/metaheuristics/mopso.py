@@ -39,8 +39,8 @@ class MopsoSettings:
         archive: capacity of the external archive.
         divisions: number of intervals per objective in the grid of hypercubes.
         inertia: factor on a particle's old velocity.
-        cognitive: factor on its pull towards its personal best.
-        social: factor on its pull towards a leader from the archive.
+        cognitive: factor on the velocity term that points to the particle's best position so far.
+        social: factor on the velocity term that points to a leader, a member of the archive.
         mutation_share: share of the run over which the turbulence (random displacement) fades to
             zero.
         horizon: number of evaluations of the whole run; None to take it from the termination.
@@ -83,10 +83,10 @@ def thin(
 ) -> Indices:
     """Choose the members that stay if the archive is over capacity.
 
-    Members are taken from the fullest hypercubes until all are levelled to a common height.
-    Newcomers go before old members (the papers refuse a newcomer to a fullest hypercube), otherwise
-    chance decides. One sort does this: the members of each hypercube are stacked, and the lowest
-    members of all stacks stay.
+    Members are removed from the fullest hypercubes until all of these have equally many. Newcomers
+    go before old members (the papers refuse a newcomer to a fullest hypercube), otherwise chance
+    decides. One sort does this: the members of each hypercube are stacked, and the lowest members
+    of all stacks stay.
 
     Args:
         cubes: (n,) hypercube number of each member.
@@ -169,10 +169,16 @@ class HypercubeArchive:
         return members
 
     def leaders(self, count: int, rng: np.random.Generator) -> Indices:
-        """Draw indices (count,) of members at random as leaders; members of sparse hypercubes are
-        preferred.
+        """Draw members at random as leaders. Members of sparse hypercubes are preferred.
 
         The archive must not be empty.
+
+        Args:
+            count: number of draws.
+            rng: source of randomness.
+
+        Returns:
+            (count,) indices of the members.
         """
         drawn = np.searchsorted(self._leader_chances, rng.random(count), side="right")
         return np.minimum(drawn, len(self) - 1)
@@ -232,8 +238,8 @@ def replaces_best(
 ) -> Mask:
     """Return a mask (n,) of the particles whose new point becomes their personal best.
 
-    Less violation wins. At equal violation a dominating point wins and a dominated one loses;
-    between incomparable points a fair coin decides.
+    A point with less violation becomes the best. At equal violation a dominating point does and a
+    dominated one does not; between incomparable points chance decides.
 
     Args:
         objectives, violation: (n, n_obj) and (n,) of the new points.

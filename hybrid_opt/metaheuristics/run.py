@@ -218,7 +218,7 @@ class CarryProblem(Problem):  # type: ignore[misc]
         evaluated: Callable[[int], None] = lambda count: None,
         task: Task | None = None,
     ) -> None:
-        """Pose the problem.
+        """Store the evaluator, and set the number and bounds of the variables.
 
         Args:
             evaluator: evaluator of the candidates.

@@ -176,8 +176,7 @@ def grip_budget(workcell: Workcell) -> GripBudget:
 
 def required_at_rest(workcell: Workcell) -> Array:
     """Compute the normal force (2,) [N] with which each robot holds the payload at rest at start
-    and goal in every case of the uncertainty: `GripBudget.required` without the search for
-    remedies.
+    and goal in every case of the uncertainty.
 
     Raises:
         SettingsError: some cases of the uncertainty cannot be held by any force, or the uncertainty
@@ -187,7 +186,7 @@ def required_at_rest(workcell: Workcell) -> Array:
 
 
 def _ends_at_rest(workcell: Workcell) -> BoxMotion:
-    """Build a motion of two samples: the payload at rest at the start and at the goal."""
+    """Build a box motion of two samples: the payload at rest at the start and at the goal."""
     poses = np.array(
         [way.lower for way in (workcell.task.waypoints[0], workcell.task.waypoints[-1])]
     )
@@ -267,8 +266,15 @@ def reserve(model: RobustModel, motion: HeldMotion, required: Array, allowed: Ar
 
 
 def _last_factor(excess: Callable[[float], float], near: float, far: float) -> float:
-    """Return the factor between `near` and `far`, as close to `far` as possible, at which
-    `excess(factor)` is not positive; NaN if `excess(near)` is positive.
+    """Find the factor closest to `far` at which a function is not positive.
+
+    Args:
+        excess: function of the factor.
+        near: begin of the considered range of factors.
+        far: end of this range.
+
+    Returns:
+        The factor; NaN if the function is positive at `near`.
     """
     if excess(near) > 0.0:
         return float("nan")
@@ -332,8 +338,10 @@ def _stronger(required: Array, allowed: Array) -> Iterator[Remedy]:
 
 
 def _of_cell(workcell: Workcell, excess: Callable[[Workcell], float]) -> Iterator[Remedy]:
-    """Yield changes of a cell that bring its required forces within the reference forces: of the
-    mass, of the friction, and of ranges of the uncertainty, each as small as possible.
+    """Yield the smallest changes of a cell that bring its required forces within the reference
+    forces.
+
+    Changed are the mass, the friction, and ranges of the uncertainty, one at a time.
 
     Args:
         workcell: the cell.
@@ -374,8 +382,14 @@ def _of_cell(workcell: Workcell, excess: Callable[[Workcell], float]) -> Iterato
 
 
 def _smallest_change(excess: Callable[[float], float], far: float) -> float | None:
-    """Return the factor between one and `far`, as close to one as possible, at which
-    `excess(factor)` is not positive; None if `excess(far)` is positive.
+    """Find the factor closest to one at which a function is not positive.
+
+    Args:
+        excess: function of the factor, positive at one.
+        far: other end of the considered range of factors.
+
+    Returns:
+        The factor; None if the function is positive at `far`.
     """
     if excess(far) > 0.0:
         return None

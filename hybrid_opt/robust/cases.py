@@ -59,8 +59,8 @@ def nominal_case(workcell: Workcell) -> Array:
 
 
 def worst_cases(contact: ContactModel, uncertainty: Uncertainty, leader: int = 0) -> Array:
-    """Return the worst cases (k, 18) of an uncertainty: the largest squeeze that any of them needs
-    holds the box in every case within the ranges.
+    """Return the worst cases (k, 18) of an uncertainty. The largest squeeze (pair of opposite
+    normal forces) that one of them needs holds the box in every case within the ranges.
 
     Each row states true values of friction, mass and the other uncertain quantities, laid out by
     `symbolic.contact.worst_cases.CASE_SIZES`.
@@ -116,8 +116,13 @@ def random_cases(
 
 
 def _in_discs(rng: np.random.Generator, radius: float, n: int, discs: int) -> Array:
-    """Draw points (n, discs, 2) [m], uniformly distributed in discs of a radius [m] about the
-    origin.
+    """Draw points (n, discs, 2) [m], uniformly distributed in discs about the origin.
+
+    Args:
+        rng: random generator.
+        radius: radius of the discs [m].
+        n: number of draws.
+        discs: number of discs, with one point each per draw.
     """
     angle = rng.uniform(0.0, 2.0 * np.pi, (n, discs))
     reach = radius * np.sqrt(rng.random((n, discs)))
@@ -138,7 +143,7 @@ class GoverningCases:
         commanded: (n,) index of the case that needs the largest commanded force.
         leading: (n,) index of the case in which the leading arm's force exceeds the commanded force
             most.
-        share: (n,) share of this excess that acts on the leading arm, from `transmitted_share`.
+        share: (n,) share of this excess that acts on the leading arm, see `transmitted_share`.
         leading_share: rise of the leading arm's force per newton of commanded force.
     """
 
@@ -150,7 +155,11 @@ class GoverningCases:
     leading_share: float
 
     def at(self, rows: NDArray[np.intp]) -> GoverningCases:
-        """Return the governing cases at the samples with these indices."""
+        """Return the governing cases at some of the samples.
+
+        Args:
+            rows: (m,) indices of the samples.
+        """
         cases = self.commanded[rows], self.leading[rows]
         found = self.force[rows], *cases, self.share[rows]
         return GoverningCases(self.leader, *found, self.leading_share)
@@ -174,8 +183,8 @@ class GoverningCases:
 
 
 def transmitted_share(difference: Array, uncertainty: Uncertainty) -> Array:
-    """Compute which share of the difference of both normal forces acts on the leading arm, for the
-    payload mass that loads this arm most.
+    """Compute the share of the difference of both normal forces that acts on the leading
+    (position-controlled) arm, for the payload mass that loads this arm most.
 
     A positive difference is largest for the largest mass, and acts in full: the share is 1. A
     negative difference is smallest in size for the least mass: the share is (1 - s) / (1 + s) with

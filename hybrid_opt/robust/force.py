@@ -113,7 +113,15 @@ def box_motion(motion: HeldMotion) -> BoxMotion:
 
 
 def tile_motion(motion: HeldMotion, times: int) -> BoxMotion:
-    """Repeat the samples of a motion `times` times, one copy after the other."""
+    """Repeat the samples of a motion several times, one copy after the other.
+
+    Args:
+        motion: motion of n samples.
+        times: number of copies.
+
+    Returns:
+        Motion of times * n samples.
+    """
     return BoxMotion(*[np.tile(values, (times, 1)) for values in motion_inputs(motion)])
 
 
@@ -249,7 +257,12 @@ class RobustModel:
         return self._load(self.workcell, f"case_slack_function {commanded}", make, lanes=0)
 
     def worst_cases(self, uncertainty: Uncertainty, leader: int) -> Array:
-        """Return the worst cases (k, 18) of an uncertainty, read-only.
+        """Return the worst cases (k, 18) of an uncertainty, read-only. A force that holds the box
+        in all of them holds it in every case within the ranges.
+
+        Args:
+            uncertainty: ranges of the uncertain quantities.
+            leader: index of the position-controlled arm.
 
         Raises:
             SettingsError: the uncertainty leaves no friction or contact patch.
@@ -283,7 +296,7 @@ class RobustModel:
             cases: (m, 18) one case per sample.
             leader: index of the leading arm.
             threads: number of threads, 0 for one per core.
-            displaced: True if a case displaces a pad; False is faster.
+            displaced: True if any case displaces a pad; False is faster.
         """
         function = self._squeeze(1 - leader, displaced)
         return function.batch(*motion_inputs(motion), cases, threads=threads)["normal_force"]
@@ -329,8 +342,12 @@ class RobustModel:
         return found
 
     def nominal(self, motion: HeldMotion, leader: int = 0) -> Array:
-        """Compute the least normal forces (n, 2) [N] with which both robots hold the box at n
-        samples if nothing is uncertain.
+        """Compute the least normal forces (n, 2) [N] with which both robots hold the box if nothing
+        is uncertain.
+
+        Args:
+            motion: box motion at n samples.
+            leader: index of the position-controlled arm.
         """
         return np.asarray(self.least_squeeze(motion, self._nominal, leader)[0])
 
@@ -541,8 +558,12 @@ class RobustModel:
         return share.reshape(k, n)
 
     def _friction_left(self, cases: Array) -> float:
-        """Compute the least share of the friction coefficient that remains in cases (k, 18) with
-        displaced pads, less a reserve. It scales forces for `slack`, which ignores displacements.
+        """Compute the share of the friction coefficient that displaced pads leave, less a reserve,
+        in the worst of some cases. Forces are scaled by it for `slack`, which ignores
+        displacements.
+
+        Args:
+            cases: (k, 18) cases.
         """
         apart = np.linalg.norm(cases[:, 11:13] - cases[:, 13:15], axis=1)
         lost = self._contact.friction_lost(apart) / cases[:, :2].min(axis=1)
@@ -575,6 +596,10 @@ class RobustModel:
 def allowed_factor(workcell: Workcell, uncertainty: Uncertainty) -> float:
     """Find the largest factor on the ranges of an uncertainty that leaves some friction and contact
     patch, at most `LARGEST_FACTOR`.
+
+    Args:
+        workcell: the cell.
+        uncertainty: ranges of the uncertain quantities.
     """
     low, high, contact = 0.0, LARGEST_FACTOR, command_model(workcell)
     if _has_positive_remainders(contact, uncertainty.scaled(high)):
@@ -589,6 +614,10 @@ def allowed_factor(workcell: Workcell, uncertainty: Uncertainty) -> float:
 def _has_positive_remainders(contact: ContactModel, uncertainty: Uncertainty) -> bool:
     """Return True if friction coefficients, contact patches, mass and transmitted force remain
     positive at the worst ends of the ranges.
+
+    Args:
+        contact: contact model with the nominal values.
+        uncertainty: ranges of the uncertain quantities.
     """
     shares = [1.0 - uncertainty.mass, 1.0 - uncertainty.tracking]
     left = [*contact.least_friction(uncertainty), contact.displacement_margin(uncertainty), *shares]
@@ -617,7 +646,8 @@ def interpreted_robust_model(workcell: Workcell) -> RobustModel:
 
 @dataclass(frozen=True)
 class RobustPrice:
-    """Price of robustness: the normal forces of one carry, against the size of the uncertainty.
+    """Normal forces that hold the box in every case, for one carry and several sizes of the
+    uncertainty.
 
     Attributes:
         uncertainty: the workcell's uncertainty.
@@ -647,7 +677,8 @@ def robust_price(
     threads: int = 1,
     points: int = POINTS,
 ) -> RobustPrice:
-    """Compute the price of robustness of a carry: its forces against the size of the uncertainty.
+    """Compute the normal forces that hold the box of a carry in every case, for several sizes of
+    the uncertainty.
 
     Args:
         model: computes robust forces of the carry's workcell.

@@ -73,13 +73,17 @@ class PathPoints:
         return len(self.a)
 
     def at(self, rows: NDArray[np.intp]) -> PathPoints:
-        """Return the points with these indices."""
+        """Return some of the points.
+
+        Args:
+            rows: (m,) indices of the points.
+        """
         return PathPoints(*[values[rows] for values in self.driven])
 
     @property
     def driven(self) -> tuple[Array, ...]:
-        """Arrays pose, first, second, a and w, in the order in which `case_slopes_function` takes
-        them.
+        """The arrays pose, first, second, a and w of this record, in the order of the arguments of
+        `case_slopes_function`.
         """
         return self.pose, self.first, self.second, self.a, self.w
 
@@ -99,6 +103,9 @@ class RobustPath:
 
     def __init__(self, workcell: Workcell) -> None:
         """Load or build the compiled functions.
+
+        Args:
+            workcell: the cell.
 
         Raises:
             SettingsError: the pads' normals are not opposite, or the workcell's uncertainty leaves
@@ -166,15 +173,20 @@ class RobustPath:
         return rows, governing_cases(known, self._set, LEADER, beyond, self._share)
 
     def most_demanding(self, points: PathPoints, count: int) -> tuple[Array, Array]:
-        """Compute forces and slopes of the `count` cases with the largest commanded forces at each
-        of n points.
+        """Compute the forces, with their derivatives, of several cases of the uncertainty at each
+        of n points: those with the largest commanded forces.
 
-        A polish needs several cases, because the governing case changes along with the path, and
-        with it the slope.
+        A polish needs several cases, because the case with the largest force changes along the
+        path, and with it the derivative.
+
+        Args:
+            points: n points of paths.
+            count: number of cases.
 
         Returns:
-            Normal forces (n, 2, count) of both robots [N], the largest commanded force first, and
-            their slopes (n, 2, count, 20) as in `at`.
+            Normal forces (n, 2, count) of both robots [N], the largest commanded force first; and
+            their derivatives (n, 2, count, 20) by the pose (6), its first and second derivative by
+            u (12), u'' and u'^2.
         """
         n, least = len(points), self._model.least_squeeze(points.motion, self._cases, LEADER)
         governing = governing_cases(least, self._set, LEADER, leading_share=self._share)
@@ -189,8 +201,15 @@ class RobustPath:
         return force, slope
 
     def slopes(self, points: PathPoints, governing: GoverningCases) -> Array:
-        """Compute the slopes (n, 2, 20) of both robots' normal forces in the governing cases at n
-        points; the columns are those of `at`.
+        """Compute the derivatives of both robots' normal forces in the governing cases.
+
+        Args:
+            points: n points of paths.
+            governing: the governing cases at these points.
+
+        Returns:
+            (n, 2, 20) derivatives by the pose (6), its first and second derivative by u (12), u''
+            and u'^2.
         """
         if not len(points):
             return np.zeros((0, 2, BY_TIMING.stop))

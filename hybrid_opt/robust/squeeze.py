@@ -73,7 +73,7 @@ class SqueezeSettings:
 
 @dataclass(frozen=True)
 class Contribution:
-    """Share of the largest commanded force that is due to one source of uncertainty.
+    """Part of the largest commanded force that is due to one source of uncertainty.
 
     Attributes:
         name: name of the source, such as 'friction', or 'least force' for the force without
@@ -120,7 +120,7 @@ class Squeeze:
         parts: contributions to the largest commanded force, the least force first. Their sum is the
             largest commanded force.
         holders: word for what holds the payload, such as pads or hands.
-        order: verb of the command, as in 'press with 80 N'.
+        order: verb of the command in texts, such as 'press' in 'press with 80 N'.
     """
 
     leader: int

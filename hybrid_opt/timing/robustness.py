@@ -115,8 +115,8 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
         model: timing model of the workcell.
         carry: the carry.
 
-        Returns:
-            One margin for each changed assumption.
+    Returns:
+        One margin for each changed quantity.
     """
     workcell = model.workcell
     payload, contacts, task = workcell.payload, workcell.contacts, workcell.task
