@@ -84,6 +84,10 @@ def _require_own(package: str, member: str) -> None:
     """Check that an imported package is part of this project, and not of another one with the same
     name.
 
+    Args:
+        package: name of the package.
+        member: name of a module that the package of this project contains.
+
     Raises:
         ImportError: the package has no such member, so it belongs to another project.
     """

@@ -113,7 +113,7 @@ class BranchCompetition:
 
 
 class _Pair:
-    """A pair of start branches, with all candidates evaluated so far."""
+    """A pair of start branches, one for each arm, with all candidates evaluated so far."""
 
     def __init__(self, branches: tuple[int, int], evaluator: CandidateEvaluator) -> None:
         self.branches, self.evaluator = branches, evaluator
@@ -136,8 +136,10 @@ class _Pair:
         self.rounds += 1
 
     def try_out(self, x: Array) -> bool:
-        """Evaluate candidates x (n, n_var) and return True if both arms can follow at least one of
-        them.
+        """Evaluate candidates, and return True if both arms can follow at least one of them.
+
+        Args:
+            x: (n, n_var) decision vectors.
         """
         found = self.evaluator.evaluate(x)
         self._parts.append(found)

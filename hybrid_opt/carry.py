@@ -252,7 +252,7 @@ class Carry(Displayable):
 
     @property
     def figures(self) -> dict[str, float]:
-        """Scalar figures of an evaluated carry by name, in SI units, for storage and reports.
+        """Numbers that describe an evaluated carry, by name, in SI units, for storage and reports.
 
         `feasible` is 1 or 0. `objective_<name>` has no penalty. Mean forces are means over time.
         """
@@ -286,8 +286,11 @@ class Carry(Displayable):
 
 
 def joints_of(workcell: Workcell, values: Array) -> tuple[Array, Array]:
-    """Split joint values of both arms side by side (n, all joints) into one array (n, n_joints) per
-    arm.
+    """Split joint values of both arms side by side into one array (n, n_joints) per arm.
+
+    Args:
+        workcell: the cell.
+        values: (n, all joints) values, the first arm first.
     """
     first = len(workcell.robots[0].velocity_max)
     return values[:, :first], values[:, first:]

@@ -93,7 +93,9 @@ class Cell:
         self._polishers: dict[PolishSettings, Polisher] = {}
 
     def __reduce__(self) -> tuple[type[Cell], tuple[Any, ...]]:
-        """Describe the cell for pickling without its functions; another process loads them anew."""
+        """Return a constructor call that replaces the cell when it is pickled: without functions,
+        which another process loads anew.
+        """
         return Cell, (self.workcell, self._objectives, self._threads)
 
     @classmethod
@@ -217,7 +219,7 @@ class Cell:
 
     @cached_property
     def path_timer(self) -> PathTimer:
-        """Solver that times many paths in compiled code."""
+        """Compiled solver that computes the fastest timings of many paths."""
         from hybrid_opt.timing.path_timer import PathTimer
 
         return PathTimer(self.compiled, threads=self.threads)

@@ -160,8 +160,8 @@ def _require_address(address: str) -> None:
 
 @contextmanager
 def _without_tracebacks() -> Iterator[None]:
-    """Suppress Dask's log of tracebacks inside the `with` block when the connection is lost; this
-    project reports the loss by its own error.
+    """Suppress inside the `with` block the tracebacks that Dask logs when the connection is lost.
+    This project reports the loss by its own error.
     """
     loggers = [logging.getLogger(name) for name in ("distributed", "distributed.client")]
     levels = [logger.level for logger in loggers]

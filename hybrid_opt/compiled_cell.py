@@ -91,7 +91,7 @@ class CompiledCell:
 
     @classmethod
     def of(cls, cell: Workcell | CompiledCell) -> CompiledCell:
-        """Return compiled functions of a cell; a `CompiledCell` is returned unchanged."""
+        """Return the compiled functions of a cell; a `CompiledCell` is returned unchanged."""
         return cell if isinstance(cell, CompiledCell) else cls(cell)
 
     @cached_property
@@ -109,7 +109,7 @@ class CompiledCell:
         return build_cell_model(self.workcell, self.bodies, self._searches())
 
     def _searches(self) -> tuple[ArmSearch, ArmSearch] | None:
-        """Return for each arm the search for start branches in compiled functions. An
+        """Return for each arm the search for its start branches, which uses compiled functions. An
         `InterpretedCell` returns None.
         """
         from symbolic.cell_model import own_clearance
@@ -258,7 +258,8 @@ class CompiledCell:
             levels: optimisation levels of the compiler by name of the function; the size of the C
                 text decides the others.
             bodies: True if the functions depend on the collision bodies.
-            taped: True to store functions over SX as tapes and compile only the others.
+            taped: True to compile only functions with CasADi's MX expressions. Functions with SX
+                expressions are stored as tapes, lists of operations that an interpreter runs.
 
         Raises:
             DualArmError: the model or its code cannot be built.

@@ -206,8 +206,8 @@ class SelectedCarry:
     """The carry selected from a front.
 
     Attributes:
-        row: index of the carry in the evaluations of the replica or, for a polished front, in the
-            front.
+        row: index of the carry among all evaluations of the search; for a polished front, its index
+            in the front.
         carry: the selected carry under the task's time law, with its judgement.
     """
 
@@ -240,8 +240,7 @@ def knee(points: Array) -> int:
 
     Near this point a rise of one objective by one per cent lowers the other by at most one per
     cent. The distance from the line between the front's ends (Das 1999) is not used, because it
-    depends on how far the ends were explored: one long carry at almost the least force moves that
-    knee by a newton.
+    depends on how far the ends were explored.
 
     Args:
         points: (k, 2) positive objectives of the points.
@@ -290,15 +289,21 @@ def selected_row(evaluator: CandidateEvaluator, x: Array) -> int:
 
 
 def peak_normal_forces(evaluator: CandidateEvaluator, x: Array) -> Array:
-    """Compute the peak normal force (n, 2) of each robot [N] along the carries of decision vectors
-    (n, n_var).
+    """Compute the peak normal force (n, 2) of each robot [N] along n carries.
+
+    Args:
+        evaluator: evaluator of the cell's candidates.
+        x: (n, n_var) decision vectors of the carries.
     """
     return _peaks_and_durations(evaluator, x)[0]
 
 
 def _peaks_and_durations(evaluator: CandidateEvaluator, x: Array) -> tuple[Array, Array]:
-    """Compute peak normal forces (n, 2) of both robots [N] and durations (n,) [s] of the carries of
-    decision vectors (n, n_var).
+    """Compute peak normal forces (n, 2) of both robots [N] and durations (n,) [s] of n carries.
+
+    Args:
+        evaluator: evaluator of the cell's candidates.
+        x: (n, n_var) decision vectors of the carries.
     """
     peaks, durations = [], []
     for begin in range(0, len(x), _CHUNK):

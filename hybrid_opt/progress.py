@@ -33,7 +33,8 @@ class Advance(Protocol):
 
 @contextmanager
 def progress_bar(progress: ShowProgress, what: str, total: int) -> Iterator[Advance]:
-    """Show the progress of a call inside the `with` block, and yield the function that reports it.
+    """Show the progress of a call inside the `with` block. Yield the function by which the call
+    reports progress.
 
     Args:
         progress: True for a bar, False for none, or a function of the finished and the total number

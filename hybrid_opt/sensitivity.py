@@ -173,7 +173,10 @@ class Sensitivities(Displayable):
     missing: Mapping[str, str]
 
     def __getitem__(self, key: str) -> Sensitivity:
-        """Return the effect of the number with this key.
+        """Return the effect of one number of the workcell file.
+
+        Args:
+            key: key path of the number, as in `Sensitivity.key`.
 
         Raises:
             KeyError: the number has no effect, or its effect cannot be computed.
@@ -294,12 +297,18 @@ class _Law:
         self.carry = carry
 
     def moved_by(self, number: _Number) -> bool:
-        """Return True if the motion or its duration may depend on a number."""
+        """Return True if the box motion or its duration may depend on a number of the workcell
+        file.
+        """
         return number.section == "task"
 
     def is_compiled_with(self, number: _Number, workcell: Workcell) -> bool:
-        """Return True if the duration in a cell with another value of this number needs newly
-        compiled functions: never, as the time law is interpreted.
+        """Return False: the duration in a cell with another value of a number never needs newly
+        compiled functions, because the time law is interpreted.
+
+        Args:
+            number: the number.
+            workcell: the cell with its other value.
         """
         return False
 
@@ -317,8 +326,11 @@ class _Law:
         return (after - before) / 2.0, (before - after) / 2.0
 
     def motion(self, workcell: Workcell, samples: NDArray[np.intp]) -> BoxMotion:
-        """Compute the box motion in another cell at some samples of the carry, given by their
-        indices.
+        """Compute the box motion in another cell at some samples of the carry.
+
+        Args:
+            workcell: the other cell.
+            samples: (m,) indices of the samples.
         """
         return BoxMotion(*[part[samples] for part in self._driven(workcell)[1:]])
 
@@ -351,13 +363,19 @@ class _Fastest:
         self._near = TimingSensitivity(TimingModel(self._compiled), timing)
 
     def moved_by(self, number: _Number) -> bool:
-        """Return True if the motion or its duration may depend on a number."""
+        """Return True if the box motion or its duration may depend on a number of the workcell
+        file.
+        """
         return number.section != "uncertainty"
 
     def is_compiled_with(self, number: _Number, workcell: Workcell) -> bool:
-        """Return True if a cell with another value of this number needs newly compiled functions.
+        """Return True if a cell with another value of a number needs newly compiled functions.
 
         It does if an upright base becomes tilted, or if pads whose normals are not opposite move.
+
+        Args:
+            number: the number.
+            workcell: the cell with its other value.
         """
         if number.is_limit or not self.moved_by(number):
             return False
@@ -384,8 +402,12 @@ class _Fastest:
         return CarryLimits(workcell).ratios(carry, self._limits)
 
     def motion(self, workcell: Workcell, samples: NDArray[np.intp]) -> BoxMotion:
-        """Compute the box motion in another cell at some samples of the carry, given by their
-        indices, with unchanged path speeds.
+        """Compute the box motion in another cell at some samples of the carry, with unchanged path
+        speeds.
+
+        Args:
+            workcell: the other cell.
+            samples: (m,) indices of the samples.
         """
         points, speeds = waypoints_of(workcell.task, self.carry.x), self._near.speeds
         basis = path_basis(len(points), self.carry.parameter[samples])
@@ -398,8 +420,9 @@ class _Fastest:
 
 
 def _numbers(workcell: Workcell) -> Iterator[_Number]:
-    """Yield all numbers whose effects are computed, with the values that the workcell file states
-    or the defaults."""
+    """Yield all numbers of a workcell whose effects are computed. Their values are those in the
+    workcell file, or defaults.
+    """
     text = workcell.text or safe_io.read_bytes(workcell.source, safe_io.WORKCELL_BYTES)
     data = safe_io.toml_tables(text)
     yield from _of(data["payload"], "payload", PAYLOAD_UNITS, workcell.payload)

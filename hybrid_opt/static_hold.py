@@ -249,7 +249,9 @@ def _ends(workcell: Workcell, outputs: Outputs) -> list[tuple[Array, Array]]:
 
 
 class _Still:
-    """Check of the payload at rest at start and goal, for scaled payload mass and friction."""
+    """Check of all limits with the payload at rest at start and goal, for other values of payload
+    mass and friction.
+    """
 
     def __init__(self, workcell: Workcell, postures: list[tuple[Array, Array]]) -> None:
         ends = (workcell.task.waypoints[0].lower, workcell.task.waypoints[-1].lower)
@@ -264,7 +266,7 @@ class _Still:
             self._models = [build_robot_model(robot) for robot in workcell.robots]
 
     def exceeded(self, mass: float = 1.0, friction: float = 1.0) -> list[StaticUtilisation]:
-        """Return the limits that are exceeded at start or goal.
+        """Return the limits that are exceeded at start or goal; empty for none.
 
         Args:
             mass: factor on the payload's mass.
@@ -323,9 +325,12 @@ class _Still:
 
     def remedy(self, exceeded: list[StaticUtilisation]) -> str:
         """Return a text with the largest payload mass, the least friction and the least patch
-        radius that keep the exceeded limits.
+        radius that keep some limits.
 
         Mass and friction are alternatives, each with everything else unchanged.
+
+        Args:
+            exceeded: the limits that the present cell exceeds.
         """
         ways = []
         if any(use.quantity != PRESSURE for use in exceeded):
@@ -357,8 +362,8 @@ class _Still:
         return f"friction of at least {wanted}"
 
     def _bears(self, mass: float = 1.0, friction: float = 1.0) -> bool:
-        """Return True if forces and joint torques are within their limits; pressure shifts are
-        ignored.
+        """Return True if all forces and joint torques at rest are within their limits. Pressure
+        shifts are ignored.
 
         Args:
             mass: factor on the payload's mass.

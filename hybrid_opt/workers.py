@@ -44,7 +44,12 @@ RESUME_HINT = "what was computed is kept: continue with --resume"
 
 
 def ignore_result(index: int, result: object) -> None:
-    """Do nothing with the result of a call: the default of `on_result` in `Workers.map`."""
+    """Do nothing with the result of a call. This is the default of `on_result` in `Workers.map`.
+
+    Args:
+        index: index of the call; not used.
+        result: its result; not used.
+    """
 
 
 class Workers(ABC):
@@ -81,7 +86,16 @@ class Workers(ABC):
     def _results(
         self, function: Callable[[Argument], Result], arguments: Sequence[Argument]
     ) -> Iterator[tuple[int, Result]]:
-        """Yield the index and the result of each call, in the order in which the calls end."""
+        """Call a function once per argument, and yield the results in the order in which the calls
+        end.
+
+        Args:
+            function: function of one argument.
+            arguments: one argument for each call.
+
+        Yields:
+            Index of the call, and its result.
+        """
 
     @abstractmethod
     def close(self) -> None:
@@ -195,7 +209,12 @@ def finished(calls: dict[Future[Result], int]) -> Iterator[tuple[int, Result]]:
 
 def call_safely(function: Callable[[Argument], Result], argument: Argument) -> Result:
     """Call a function with one linear-algebra thread. Errors that cannot be pickled are converted
-    to errors that can."""
+    to errors that can.
+
+    Args:
+        function: the function.
+        argument: its argument.
+    """
     try:
         with one_thread():
             return function(argument)

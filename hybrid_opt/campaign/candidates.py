@@ -53,13 +53,15 @@ class EvaluatedCandidates:
 def _groups(
     n_var: int, objective_names: tuple[str, ...], reasons: tuple[str, ...] = REASONS
 ) -> dict[str, list[str]]:
-    """Return the names of the columns of numbers, by the field of `Evaluations` that the columns
-    hold.
+    """Return the names of the columns of numbers in a file of candidates.
 
     Args:
         n_var: length of the decision vector.
         objective_names: names of the objectives.
         reasons: names of the constraints.
+
+    Returns:
+        Names of columns by the field of `Evaluations` that they hold.
     """
     return {
         "x": [f"x_{k + 1}" for k in range(n_var)],

@@ -272,8 +272,8 @@ def _clear(root: Path) -> None:
     """Remove everything in a results folder.
 
     Markers of finished stages are removed first and the configuration last. So after an
-    interruption no stage looks finished whose files are missing, and the folder can be overwritten
-    again.
+    interruption no stage with missing files is marked as finished, and the folder can be
+    overwritten again.
     """
     order = {STAGES: 0, CONFIGURATION: 2}
     with storing(root):
@@ -285,8 +285,12 @@ def _clear(root: Path) -> None:
 
 
 def _stored_cell(root: Path, files: CellFiles) -> Workcell:
-    """Return the workcell in the results folder, after copying the given files there if it is
-    missing.
+    """Return the workcell in a results folder. If it is missing, the given files are copied there
+    before.
+
+    Args:
+        root: the results folder.
+        files: files of the workcell.
 
     Raises:
         ResultsError: the workcell in the folder was changed after the campaign began.

@@ -49,7 +49,13 @@ class PolishRequest:
 
 
 def polish_front(request: PolishRequest, progress: ShowProgress = False) -> bytes:
-    """Polish one front and return the content of its file, a `PolishedFront` as JSON."""
+    """Polish one front and return the content of its file, a `PolishedFront` as JSON.
+
+    Args:
+        request: the front, with the settings and the cell.
+        progress: True for a progress bar, or a function of the finished and the total number of
+            attempts.
+    """
     use_one_thread()
     settings = request.settings
     done = polish(
@@ -94,8 +100,11 @@ def polish_stage(
 
 
 def _is_polished(folder: CampaignFolder, front: Front) -> bool:
-    """Return True if the polished front is stored and undamaged; a damaged file is to be computed
-    again.
+    """Return True if the polished front of a front is stored in a results folder and undamaged.
+
+    Args:
+        folder: the results folder.
+        front: the front before the polish.
     """
     exists = polished_file(folder.root, *front.key).exists()
     return is_whole(exists, lambda: read_polished(folder.root, front))

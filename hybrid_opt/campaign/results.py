@@ -128,8 +128,8 @@ class CampaignResults:
 
     @property
     def _figures(self) -> dict[str, str]:
-        """Number and sizes of the fronts by title, and the file of the recommended carry if there
-        is one.
+        """Texts by title for the display: number and sizes of the fronts, and the file of the
+        recommended carry if there is one.
         """
         sizes: dict[str, list[int]] = {}
         for front in self.fronts:
@@ -162,7 +162,11 @@ class CampaignResults:
         return self.settings.objectives
 
     def of(self, algorithm: str) -> tuple[Replica, ...]:
-        """Return the replicas of the algorithm with this name, by replica number."""
+        """Return the replicas of one algorithm, by replica number.
+
+        Args:
+            algorithm: name of the algorithm.
+        """
         return tuple(found for found in self.replicas if found.algorithm == algorithm)
 
     @cached_property

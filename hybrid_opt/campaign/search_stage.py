@@ -42,6 +42,11 @@ def search_replica(request: SearchRequest, progress: ShowProgress = False) -> by
 
     The random numbers depend only on the campaign's seed, the algorithm's name and the replica's
     number.
+
+    Args:
+        request: the replica, with the settings and the cell.
+        progress: True for a progress bar, or a function of the finished and the total number of
+            evaluations.
     """
     settings, algorithm = request.settings, request.algorithm
     cell = loaded_cell(request.files, settings.objectives)
@@ -99,9 +104,11 @@ def _is_done(folder: CampaignFolder, key: tuple[str, int]) -> bool:
 
 
 def _replicas(folder: CampaignFolder) -> dict[tuple[str, int], Path]:
-    """Return the file of every replica by algorithm name and replica number.
+    """Return the file of every replica in a results folder.
 
-    They are ordered by replica number, so that every algorithm has results early.
+    Returns:
+        Path by algorithm name and replica number, ordered by replica number, so that every
+        algorithm has results early.
     """
     settings = folder.settings
     return {

@@ -34,7 +34,9 @@ SIZE_KEYS = ("population", "swarm", "batch")
 
 
 def sized(algorithm: str, size: int) -> dict[str, Any]:
-    """Return the settings with which an algorithm evaluates `size` candidates per generation."""
+    """Return the settings by name with which an algorithm evaluates `size` candidates per
+    generation.
+    """
     known = asdict(metaheuristics.settings_of(algorithm))
     return {key: size for key in SIZE_KEYS if key in known}
 
@@ -113,9 +115,12 @@ class CampaignSettings:
     def replica_rng(self, algorithm: str, replica: int) -> np.random.Generator:
         """Return the random generator of one replica, its only source of randomness.
 
-        The generator depends only on the campaign's seed, the algorithm's name and the replica's
-        number. It does not depend on other algorithms, the number of replicas, or the order of
-        work.
+        The generator depends only on the campaign's seed and both arguments. It does not depend on
+        other algorithms, the number of replicas, or the order of work.
+
+        Args:
+            algorithm: name of the search algorithm.
+            replica: number of the replica, from 0.
         """
         key = (zlib.crc32(algorithm.encode()), replica)
         return np.random.default_rng(np.random.SeedSequence(self.seed, spawn_key=key))
@@ -162,7 +167,9 @@ class Configuration:
 
 @dataclass(frozen=True)
 class StageMark:
-    """Content of stages/NAME.json: status, settings and computing time [s] of one stage."""
+    """Content of the file stages/NAME.json: status, settings and computing time [s] of one stage of
+    a study.
+    """
 
     status: StageStatus
     settings: Mapping[str, Any]
@@ -207,20 +214,34 @@ def replica_file(root: Path, algorithm: str, replica: int) -> Path:
 def selected_file(root: Path, algorithm: str, replica: int) -> Path:
     """Return the path of the trajectory file of the carry that was selected from the front of one
     replica.
+
+    Args:
+        root: the results folder.
+        algorithm: name of the search algorithm.
+        replica: number of the replica, from 0.
     """
     return root / SELECTED / algorithm / f"{replica:02d}.json"
 
 
 def polished_file(root: Path, algorithm: str, replica: int) -> Path:
-    """Return the path of the file of the polished front of one replica, or of the union of all
-    replicas if `algorithm` is `UNION`.
+    """Return the path of the file of a polished front.
+
+    Args:
+        root: the results folder.
+        algorithm: name of the search algorithm; `UNION` for the front of all replicas together.
+        replica: number of the replica, from 0.
     """
     return root / POLISHED_FOLDER / algorithm / f"{replica:02d}.json"
 
 
 def polished_selected_file(root: Path, algorithm: str, replica: int) -> Path:
-    """Return the path of the trajectory file of the carry selected from the polished front of one
-    replica.
+    """Return the path of the trajectory file of the carry that was selected from the polished front
+    of one replica.
+
+    Args:
+        root: the results folder.
+        algorithm: name of the search algorithm.
+        replica: number of the replica, from 0.
     """
     return root / SELECTED / f"{algorithm}{POLISHED_SUFFIX}" / f"{replica:02d}.json"
 

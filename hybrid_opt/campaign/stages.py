@@ -75,8 +75,8 @@ class Stage:
 
 
 def run_stages(folder: CampaignFolder, stages: Sequence[Stage], progress: Progress) -> None:
-    """Run those stages, in order, that are not done or whose files are damaged. Once a stage has
-    run, all later stages run as well.
+    """Run the stages of a study that are not done, or whose files are damaged, in order. Once a
+    stage has run, all later stages run as well.
 
     Args:
         folder: the open results folder.
@@ -112,7 +112,9 @@ def _path(folder: CampaignFolder, stage: Stage) -> Path:
 
 
 def _marker(folder: CampaignFolder, stage: Stage) -> StageMark | None:
-    """Return the marker of a stage; None if it never began."""
+    """Return the marker of a stage, a file with its status, from a results folder; None if the
+    stage never began.
+    """
     path = _path(folder, stage)
     return (
         read_record(StageMark, path, "delete it to run the stage again") if path.exists() else None
@@ -129,6 +131,10 @@ def _mark(folder: CampaignFolder, stage: Stage, status: StageStatus, seconds: fl
 
 def check_stages(folder: CampaignFolder, stages: Sequence[Stage]) -> None:
     """Check, before any work, that every stage that has begun had the present settings.
+
+    Args:
+        folder: the open results folder.
+        stages: all stages of the study.
 
     Raises:
         ResultsError: a stage began with other settings.
@@ -238,6 +244,9 @@ def read_branches(root: Path) -> BranchCompetition | None:
     """Read from a results folder the competition that chose a study's start branches; None if the
     workcell file states them.
 
+    Args:
+        root: the results folder.
+
     Raises:
         ResultsError: the stored competition is damaged.
     """
@@ -320,6 +329,10 @@ def loaded_cell(files: CellFiles, objectives: tuple[str, ...]) -> Cell:
     """Return the cell of stored workcell files. Each process caches the last cells.
 
     Candidates are evaluated by a single thread, because several workers share the cores.
+
+    Args:
+        files: files of the workcell.
+        objectives: names of the objectives.
     """
     return Cell.from_files(files, objectives, threads=1)
 
@@ -353,8 +366,7 @@ class ReadyCell:
 
     @classmethod
     def of(cls, objectives: tuple[str, ...], workcell: Workcell) -> ReadyCell:
-        """Load a cell with everything that it would otherwise load on first use: its files may be
-        temporary.
+        """Load a cell with all compiled functions at once, because its files may be temporary.
 
         Args:
             objectives: names of the cell's objectives.
@@ -395,6 +407,12 @@ def cells_of(files: CellFiles, objectives: tuple[str, ...], driven: bool) -> Cel
 def ready_cells(cells: Cells) -> tuple[ReadyCell, ...]:
     """Load the compiled functions of cells, after building those that are missing. Each process
     caches the latest result.
+
+    Args:
+        cells: files and names of the objectives of each cell.
+
+    Returns:
+        The cells, in the same order.
     """
     return tuple(with_cell(partial(ReadyCell.of, names), files) for files, names in cells)
 

@@ -38,13 +38,15 @@ share."""
 
 
 def text_of(shown: object) -> str:
-    """Format an object as text: a heading, then one line per figure."""
+    """Format an object of this library as text: a heading, then one line per number that describes
+    it.
+    """
     return "\n".join([heading_of(shown), *lines(figures_of(shown))])
 
 
 def html_of(shown: object) -> str:
-    """Format an object as HTML for a notebook: a heading, its figures, and its picture; for a job
-    or a recommendation its text and its picture.
+    """Format an object of this library as HTML for a notebook: a heading, its numbers, and its
+    picture. A job or a recommendation is shown as its text and its picture.
     """
     if isinstance(shown, Job | Recommendation):
         return f"<div><pre>{html.escape(repr(shown))}</pre>{picture_of(shown)}</div>"
@@ -54,7 +56,7 @@ def html_of(shown: object) -> str:
 
 @singledispatch
 def heading_of(shown: object) -> str:
-    """Describe an object in one line."""
+    """Describe an object of this library in one line."""
     raise NotImplementedError(f"{type(shown).__name__} has no display")
 
 
@@ -139,7 +141,7 @@ def _(found: Recommendation) -> str:
 
 
 def _torques(uses: Array) -> str:
-    """Format ratios of joint torques to their limits in percent, separated by commas."""
+    """Format ratios (n,) of joint torques to their limits in percent, separated by commas."""
     return ", ".join(map(torque_use, uses.tolist()))
 
 

@@ -27,7 +27,7 @@ def scene_data(
     geometry: CellGeometry, carry: Carry, marked: Collection[str] = ()
 ) -> dict[str, Any]:
     """Collect what `scene.js` needs to draw a cell: shapes, arms, contacts, and the region in view,
-    as JSON values.
+    as JSON values by name.
 
     Args:
         geometry: bodies of the cell.
@@ -72,8 +72,8 @@ def asset(name: str) -> str:
 
 
 def embedded_json(document: Any) -> str:
-    """Convert JSON values to text that can stand in an HTML script element: no text in it can end
-    the element or open another.
+    """Convert JSON values to text for an HTML script element. No part of the text can end the
+    element or begin another one.
     """
     text = json.dumps(document, allow_nan=False, separators=(",", ":"))
     for letter in "<>&\u2028\u2029":
@@ -162,6 +162,9 @@ class CarryView:
 
     def save(self, path: str | Path) -> None:
         """Write the page into a file.
+
+        Args:
+            path: path of the file.
 
         Raises:
             DisplayError: the file cannot be written.

@@ -22,8 +22,12 @@ TERMINAL_WIDTH = 100
 
 
 def number(value: float | None, digits: int = 2, scale: float = 1.0) -> str:
-    """Format a number multiplied by `scale` with a fixed number of decimals; `NOTHING` if it is
-    None or not finite.
+    """Format a number with a fixed number of decimals; `NOTHING` if it is None or not finite.
+
+    Args:
+        value: the number.
+        digits: number of decimals.
+        scale: factor by which the number is multiplied first.
     """
     if value is None or not math.isfinite(value):
         return NOTHING
@@ -43,7 +47,12 @@ def torque_use(use: float | None) -> str:
 
 
 def counted(count: int, noun: str) -> str:
-    """Format a number with a noun, such as '1 point' and '3 points'. The plural adds an s."""
+    """Format a count with a noun, such as '1 point' and '3 points'.
+
+    Args:
+        count: the count.
+        noun: the noun in the singular; its plural adds an s.
+    """
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
@@ -64,8 +73,10 @@ class Quantity:
     scale: float = 1.0
 
     def heading(self, whose: str = "") -> str:
-        """Format the heading of a column: name, owner of the quantity (`whose`, such as a robot),
-        and unit.
+        """Format the heading of a column: the quantity's name and unit.
+
+        Args:
+            whose: owner of the quantity, such as a robot, which follows the name; '' for none.
         """
         named = f"{self.name}, {whose}" if whose else self.name
         return f"{named} [{self.unit}]" if self.unit else named
@@ -75,12 +86,21 @@ class Quantity:
         return number(value, self.digits, self.scale)
 
     def mean(self, mean: float | None, std: float | None) -> str:
-        """Format a mean and a standard deviation in SI units as 'mean ± deviation'."""
+        """Format a mean and a standard deviation as 'mean ± deviation'.
+
+        Args:
+            mean: the mean in SI units.
+            std: the standard deviation in SI units.
+        """
         return f"{self(mean)} ± {self(std)}"
 
     def spread(self, middle: float, low: float, high: float) -> str:
-        """Format a middle value and its range as 'middle [low, high]'; without the range if low
-        equals high.
+        """Format a value and its range as 'middle [low, high]'; without the range if it is a single
+        value.
+
+        Args:
+            middle: the value in SI units.
+            low, high: ends of the range in SI units.
         """
         if low == high or not math.isfinite(middle):
             return self(middle)
@@ -183,7 +203,11 @@ def text_table(rows: Sequence[Sequence[str]], left: Collection[int] = (0,)) -> s
 
 
 def lines(figures: Mapping[str, str]) -> list[str]:
-    """Format named texts as one line each, 'name  text', with the texts aligned."""
+    """Format named texts as one line each, 'name  text', with all texts in one column.
+
+    Args:
+        figures: texts by name.
+    """
     width = max((len(name) for name in figures), default=0)
     return [f"  {name:<{width}}  {value}" for name, value in figures.items()]
 

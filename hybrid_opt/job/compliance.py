@@ -123,15 +123,15 @@ def position_control(job: Job, stiffness: float) -> PositionControl:
 
 
 def force_margin(job: Job) -> float:
-    """Compute by how much the commanded normal force exceeds the planned force that holds the box
-    [N]: the least value of both robots over all phases in which the box is held.
+    """Compute the least excess of a commanded normal force over the planned force that holds the
+    box [N], over both robots and all phases in which the box is held.
     """
     return min(float((p.force.normal - p.force.least).min()) for p in job.held)
 
 
 def skewed(job: Job, delay: float, stiffness: float) -> Skew:
-    """Compute the effect on the contact forces if one arm is late while the box is held; the worst
-    of either arm being late.
+    """Compute the effect on the contact forces if one arm is late while the box is held, for the
+    arm whose delay has the worse effect.
 
     The arms act as quasi-static springs. A relative displacement of the pads along the contact
     normal changes the squeeze. A displacement across the normal adds a tangential force that
@@ -162,11 +162,15 @@ def _worst(job: Job, delay: float, stiffness: float) -> Skew:
 
 
 def separation(job: Job, delay: float) -> float:
-    """Compute the largest relative displacement of the pads [m] if either arm is late by a delay
-    [s] while the box is held.
+    """Compute the largest relative displacement of the pads [m] if either arm is late while the box
+    is held.
 
     The result also applies to an arm that stops alone: the delay is then the time for which the
     other arm continues at the planned speed.
+
+    Args:
+        job: the whole job.
+        delay: delay of the late arm [s].
     """
     return max(
         float(np.linalg.norm(_displacement(job, phase, late, delay)[1], axis=1).max())

@@ -207,8 +207,8 @@ def follow_line(
     """
 
     def share(way: Array) -> Array:
-        """Convert points in [0, 1] counted from the known end of the line to points counted from
-        its beginning.
+        """Convert points in [0, 1] counted from the end of the line with known joints to points
+        counted from its beginning.
         """
         return 1.0 - way if at_end else way
 
@@ -335,8 +335,13 @@ def standing_still(motion: PhaseMotion, sample: int, time: Array) -> PhaseMotion
 
 
 def carry_motion(model: TimingModel, carry: Carry) -> PhaseMotion:
-    """Return the timed motion of a carry, followed by rest until a whole number of ticks has
-    passed."""
+    """Return the timed motion of a carry, followed by rest until a whole number of ticks (`TICK`)
+    has passed.
+
+    Args:
+        model: timing model of the workcell.
+        carry: the carry.
+    """
     q, pose = np.ascontiguousarray(carry.q), np.ascontiguousarray(carry.pose)
     time = carry.time - carry.time[0]
     motion = PhaseMotion(
@@ -413,8 +418,8 @@ def pressing(
     """Compute a phase in which the contact forces rise from zero, or fall to zero, while box and
     arms stand still.
 
-    The load on the support of the box falls by the same profile with which the load on the arms
-    rises, so friction is never used more than while the box is held.
+    While the arms take over the weight of the box, the load on its support falls by the same
+    profile. So friction is never used more than while the box is held.
 
     Args:
         motion, hold: motion and forces of the phase that follows a rise, or precedes a fall.
@@ -433,7 +438,8 @@ def pressing(
 
 
 def waiting(motion: PhaseMotion, sample: int, duration: float) -> tuple[PhaseMotion, Force]:
-    """Compute a phase without forces in which the arms stand still while hands take hold or let go.
+    """Compute a phase without forces in which the arms stand still while hands (cups, magnets,
+    grippers) grip or release the box.
 
     Args:
         motion: motion of the phase before or after.

@@ -259,9 +259,8 @@ def job_geometry(workcell: Workcell, everywhere: bool = False) -> CellGeometry:
 
 
 def _behind_pad(body: CollisionBody, geometry: CellGeometry) -> bool:
-    """Return True if a body moves with the pads of an arm and lies behind the plane of one of them.
-
-    Pads that approach against their own normal do not count.
+    """Return True if a body of the cell `geometry` moves with the pads of an arm and lies behind
+    the plane of one of them. Pads that approach against their own normal do not count.
     """
     arm, workcell = body.frame.robot, geometry.workcell
     if arm < 0 or body.frame.joint != len(geometry.arms[arm].axes) - 1:
@@ -425,7 +424,8 @@ class JobModel:
     def _around(
         self, carry: Carry, handling: Handling
     ) -> tuple[StraightMotions, list[Phase], list[Phase]]:
-        """Plan the straight motions before and after a carry, and time them.
+        """Plan the straight motions before and after a carry, with the heights, speeds and
+        stand-off of `handling`, and time them.
 
         Returns:
             Straight motions, their phases before the carry, and their phases after it; each list
@@ -447,7 +447,7 @@ class JobModel:
         return self._known[key]
 
     def _proof(self, checker: CollisionChecker, carry: Carry) -> Certificate:
-        """Certify that a carry is free of collisions throughout."""
+        """Certify, by the job's collision checker, that a carry is free of collisions."""
         u = np.linspace(0.0, 1.0, PATH_SAMPLES)
         q = interpolated(u, carry.parameter, carry.q)
         task = self.workcell.task
@@ -455,7 +455,9 @@ class JobModel:
         return certificates(checker, self._posture, [path])[0]
 
     def _free(self, checker: CollisionChecker, line: Straight, motion: PhaseMotion) -> Certificate:
-        """Certify that a straight motion along a line is free of collisions throughout."""
+        """Certify, by the job's collision checker, that the motion along a line is free of
+        collisions.
+        """
         share = rest_to_rest_profile(1.0, PHASE_SAMPLES).value
 
         def at(u: Array) -> tuple[Array, Array, Array]:

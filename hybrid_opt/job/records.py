@@ -174,12 +174,12 @@ class Job(Displayable):
         return self.phases[-1].begin + self.phases[-1].duration
 
     def phase(self, name: str) -> Phase:
-        """Return the phase with this name."""
+        """Return the phase of the job with a given name."""
         return next(phase for phase in self.phases if phase.name == name)
 
     @property
     def held(self) -> tuple[Phase, ...]:
-        """The phases in which the box is held and moves."""
+        """The phases in which the box is held and moves, in order of time."""
         return tuple(phase for phase in self.phases if phase.name in HELD_PHASES)
 
     @property
@@ -276,7 +276,12 @@ class SampledJob:
         return tuple(names)
 
     def arm(self, index: int, values: Array) -> Array:
-        """Return the columns of one arm (0 or 1) from values (n, joints) of both arms."""
+        """Return the columns of one arm from an array of both arms.
+
+        Args:
+            index: index of the arm, 0 or 1.
+            values: (n, joints) values of both arms side by side.
+        """
         first = len(self.job.joint_names[0])
         return values[:, :first] if index == 0 else values[:, first:]
 

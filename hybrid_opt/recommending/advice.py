@@ -90,11 +90,17 @@ def commanded_margins(carry: Carry, forces: Array) -> tuple[Margin, ...]:
     enough, nominal = forces[rows, 1 - LEADER] * (1.0 + HOLDS), nominal_case(workcell)
 
     def last(change: Array, end: float) -> tuple[float, str]:
-        """Find the largest multiple of a change of the nominal case (18,), up to `end`, at which
-        the forces still hold the box.
+        """Find the largest multiple of a change of the cell's nominal values at which the forces
+        still hold the box.
 
-        Also return the name of the failure beyond this multiple; '' if the multiple is `end`. The
-        needed force has to rise with the multiple.
+        The needed force has to rise with the multiple.
+
+        Args:
+            change: (18,) change of the nominal case.
+            end: largest multiple that is tried.
+
+        Returns:
+            The multiple; and the name of the failure beyond it, '' if the multiple is `end`.
         """
         low, high = 0.0, end
         for step in range(MARGIN_BISECTIONS):
@@ -156,8 +162,11 @@ def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tu
         slope = float((durations[high] - durations[low]) / (forces[high] - forces[low]))
 
     def in_time(force: float) -> float:
-        """Convert a change of the commanded force at the same duration [N] to the change of
-        duration [s] if the commanded force stays as it is.
+        """Convert a change of the commanded force to a change of the duration [s].
+
+        Args:
+            force: change of the commanded force at the same duration [N]. The result is the change
+                of the duration at the same commanded force.
         """
         spare = float(np.interp(option.commanded - force, forces, durations))
         lost = max(forces[0] - (option.commanded - force), 0.0)
@@ -224,7 +233,12 @@ def _height(workcell: Workcell) -> tuple[Array, float]:
 
 
 def _with_pads(workcell: Workcell, change: Callable[[Contact], Contact]) -> Workcell:
-    """Return the cell with `change` applied to every pad."""
+    """Return the cell with a changed copy of every pad.
+
+    Args:
+        workcell: the cell.
+        change: function from a pad to its changed copy.
+    """
     first, second = (
         replace(change(contact), further=tuple(change(pad) for pad in contact.further))
         for contact in workcell.contacts
@@ -237,7 +251,12 @@ def _with_friction(pad: Contact) -> Contact:
 
 
 def _moved(pad: Contact, by: Array) -> Contact:
-    """Move a pad by a vector `by` (3,) in the box frame [m], projected onto the pad's face."""
+    """Return a pad that is moved along its face.
+
+    Args:
+        pad: the pad.
+        by: (3,) displacement in the box frame [m], which is projected onto the face.
+    """
     T, normal = pad.T_box_pad.copy(), pad.T_box_pad[:3, 2]
     T[:3, 3] += by - (by @ normal) * normal
     return replace(pad, T_box_pad=T)
@@ -260,8 +279,12 @@ def _larger(cup: Contact) -> Contact:
 
 
 def _strength(workcell: Workcell, other: Workcell) -> float:
-    """Return the ratio of the weakest holding force in the cell `other` to the weakest one in
-    `workcell`; 1 for pads, which do not hold by themselves.
+    """Return the ratio of the weakest holding force of two cells; 1 for pads, which have no holding
+    force.
+
+    Args:
+        workcell: the cell whose holding force is the denominator.
+        other: the cell whose holding force is the numerator.
     """
     own, new = (min(c.holding_force for c in cell.contacts) for cell in (workcell, other))
     return new / own if own else 1.0

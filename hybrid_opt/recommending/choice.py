@@ -43,7 +43,8 @@ SAMPLES_PRESSED = 32
 
 @dataclass(frozen=True)
 class Wish:
-    """Target of a recommendation, and changes of the cell for which it is made.
+    """The user's target of a recommendation, and changes of the cell for which the recommendation
+    is made.
 
     `duration` and `force` exclude each other. Without either, the product of duration and commanded
     force is minimised.
@@ -64,7 +65,7 @@ class Wish:
     uncertainty: Uncertainty | None = None
 
     def __post_init__(self) -> None:
-        """Check the values of the wish.
+        """Check the values.
 
         Raises:
             SettingsError: both a duration and a force are given, or a number is not positive.
@@ -81,7 +82,7 @@ class Wish:
 
     @property
     def numbers(self) -> dict[str, float]:
-        """Numbers of the wish that are not None, by attribute name; the uncertainty is not among
+        """Numbers of this wish that are not None, by attribute name; the uncertainty is not among
         them.
         """
         values = {name: getattr(self, name) for name in _UNITS}
@@ -115,7 +116,11 @@ class Wish:
 
 
 def wished_cell(cell: Cell, wish: Wish) -> Cell:
-    """Return the cell with the payload, reference forces and uncertainty of a wish.
+    """Return the cell with the payload, reference forces and uncertainty that a user wishes.
+
+    Args:
+        cell: the cell.
+        wish: values that replace those of the cell.
 
     Raises:
         SettingsError: robots and pads cannot hold the payload still.
@@ -161,8 +166,12 @@ class Goal:
 
     @classmethod
     def of(cls, wish: Wish, workcell: Workcell) -> Goal:
-        """Convert a wish to limits and a cost. Whatever the wish, each robot's force is limited by
-        its reference force.
+        """Convert a user's wish to limits and a cost. Each robot's force is always limited by its
+        reference force.
+
+        Args:
+            wish: the user's target.
+            workcell: the cell, with the reference forces.
         """
         allowed, longest = workcell.task.reference_force, math.inf
         cost: Callable[[float, float], float] = operator.mul
@@ -187,12 +196,22 @@ def commanded_at_most(force: float, others: Array | float = np.inf) -> Array:
 
 
 def duration_alone(duration: float, force: float) -> float:
-    """Return the duration [s] of a timed path as its cost; the force [N] is ignored."""
+    """Return the duration as the cost of a timed path.
+
+    Args:
+        duration: duration [s].
+        force: commanded force; not used.
+    """
     return duration
 
 
 def force_alone(duration: float, force: float) -> float:
-    """Return the commanded force [N] of a timed path as its cost; the duration [s] is ignored."""
+    """Return the commanded force as the cost of a timed path.
+
+    Args:
+        duration: duration; not used.
+        force: commanded force [N].
+    """
     return force
 
 
@@ -209,7 +228,12 @@ class DrivenPaths:
     """
 
     def __init__(self, cell: Cell, x: Array) -> None:
-        """Compute the geometry of the paths x (k, n_path) of a drivable cell."""
+        """Compute the geometry of the paths.
+
+        Args:
+            cell: drivable cell.
+            x: (k, n_path) decision vectors of the paths, without the force limit.
+        """
         self.x = np.atleast_2d(np.asarray(x, dtype=float))
         self._model = robust_model(cell.workcell)
         self.highest_force = cell.workcell.task.force_limit[1]
@@ -299,7 +323,8 @@ class DrivenPaths:
 
         Args:
             own: own force limit, one per path (k,) or one for all [N].
-            told: function without arguments, called `FORCES` times for a progress display.
+            told: function without arguments that advances a progress display; it is called `FORCES`
+                times.
         """
         found, limits = self.options(own), []
         if not self.robust:
@@ -339,7 +364,12 @@ class Option:
 
 
 def ranked(options: Sequence[Option], goal: Goal) -> list[Option]:
-    """Return the options that keep the limits of a goal, in order of increasing cost."""
+    """Return the timed paths that keep the limits of a goal, in order of increasing cost.
+
+    Args:
+        options: timed paths.
+        goal: limits, and the cost to minimise.
+    """
     kept = [
         option
         for option in options
@@ -360,7 +390,7 @@ def best_of_paths(
         paths: paths to which the timings belong.
         options: timings that are known already.
         goal: limits, and cost to minimise.
-        most: largest number of paths.
+        most: largest number of paths that are yielded.
     """
     best: dict[int, Option] = {}
     for option in ranked(options, goal):
@@ -379,8 +409,7 @@ def best_of_paths(
 
 
 def gentle_start(cell: Cell) -> Array:
-    """Return the decision vector (n_var,) of the hand-made path with the force limit that suits it
-    best.
+    """Return the decision vector (n_var,) of the hand-made path with its best force limit.
 
     This limit gives the least product of duration and commanded force, with forces within the
     reference forces. If every limit leads to larger forces, the limit with the least commanded
@@ -398,7 +427,8 @@ def gentle_start(cell: Cell) -> Array:
 
 
 def refuse(options: Sequence[Option], wish: Wish, goal: Goal, budget: GripBudget) -> None:
-    """Raise an error that states the possible durations and forces if no timed path fulfils a wish.
+    """Raise an error if no timed path fulfils a user's wish. The message states the possible
+    durations and forces.
 
     Args:
         options: timed paths of the front.

@@ -342,8 +342,12 @@ def required_forces(workcell: Workcell, carry: Carry) -> Array:
     """Compute the largest normal force (2,) [N] that each robot needs along a carry in any case of
     the uncertainty.
 
-    For the force-controlled arm it is the commanded force, for the position-controlled arm the
+    For the force-controlled arm this is the commanded force, for the position-controlled arm the
     force that results from it.
+
+    Args:
+        workcell: the cell.
+        carry: the carry.
     """
     uncertainty, (rows, motion) = workcell.uncertainty, subsample(carry)
     most = largest_commanded(workcell, motion, carry.normal_force[rows], uncertainty, LEADER)
@@ -353,8 +357,8 @@ def required_forces(workcell: Workcell, carry: Carry) -> Array:
 
 
 def _objections(found: CommandedForces) -> list[str]:
-    """Return sentences that object to running a carry: no job is possible, no uncertainty is
-    stated, or a stop of one arm would pull the pads too far apart.
+    """Return sentences that object to running a carry; empty for none. Objections are: no job is
+    possible, no uncertainty is stated, or a stop of one arm would pull the pads too far apart.
 
     Args:
         found: commanded forces of the carry, with its job.
@@ -379,8 +383,11 @@ def _objections(found: CommandedForces) -> list[str]:
 
 
 def is_within(required: Array, allowed: Array) -> bool:
-    """Return True if required forces (2,) [N] stay within allowed forces (2,) [N], up to the
-    relative tolerance `BETTER`.
+    """Return True if forces stay within limits, up to the relative tolerance `BETTER`.
+
+    Args:
+        required: (2,) required force of each robot [N].
+        allowed: (2,) largest allowed force of each robot [N].
     """
     return bool((required <= allowed * (1.0 + BETTER)).all())
 
