@@ -181,6 +181,9 @@ WAIT_SECONDS = 60.0
 _XACRO = re.compile(rb"xmlns:xacro\s*=")
 """Declaration of the xacro prefix. xacro looks at the prefix only, since files give several
 addresses."""
+_EXPANDED = "expanded from xacro"
+"""Comment in an expanded description. Its workcell keeps the arguments that it was made with."""
+
 _MACRO = re.compile(rb"<xacro:|\$\{|\$\(")
 _MJCF = re.compile(rb"\s*+(?:(?><\?.*?\?>|<!--.*?-->)\s*+)*+<mujoco[\s/>]", re.DOTALL)
 _PROCESS = "symbolic.read.descriptions"
@@ -237,6 +240,12 @@ def is_xacro(content: bytes) -> bool:
     The suffix of the file does not show this, since generated URDFs often keep `.xacro`.
     """
     return _XACRO.search(content) is not None and _MACRO.search(content) is not None
+
+
+def takes_arguments(content: bytes) -> bool:
+    """Return whether `xacro_arguments` may be given for a file: a xacro file, or a description
+    that this project expanded from one."""
+    return is_xacro(content) or f"<!--{_EXPANDED}-->".encode() in content
 
 
 _KINEMATICS = re.compile(
@@ -405,8 +414,10 @@ def _expand(
     document = xacro.process_file(str(path), mappings=dict(arguments))
     for mesh in document.getElementsByTagName("mesh"):
         mesh.setAttribute("filename", _by_package(mesh.getAttribute("filename"), found))
+    root = document.documentElement
+    root.insertBefore(document.createComment(_EXPANDED), root.firstChild)
     # What stands beside the root are comments that name this machine's folders.
-    text = document.documentElement.toxml()
+    text = root.toxml()
     if len(text) > safe_io.URDF_BYTES:
         raise OutsideError(
             f"expands to more than {safe_io.megabytes(safe_io.URDF_BYTES)}, which is the limit",

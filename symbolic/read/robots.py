@@ -48,6 +48,7 @@ from symbolic.read.descriptions import (
     is_xacro,
     nominal_kinematics,
     resolve_mesh,
+    takes_arguments,
 )
 from symbolic.read.tables import TableReader, read_body, read_file, read_inertia, read_pose
 from symbolic.read.urdf import LARGEST_GYRATION, Urdf, read_srdf, read_urdf
@@ -269,16 +270,14 @@ def _read_description(
 
 
 def _check_arguments(table: TableReader, path: Path, arguments: Arguments) -> None:
-    """Check that xacro arguments are given for xacro files only.
+    """Check that xacro arguments are given only for files that take them.
 
     Warn if the argument with the arm's calibration is missing or nominal.
     """
     content = safe_io.read_bytes(path, safe_io.URDF_BYTES)
-    if not is_xacro(content):
-        if arguments:
-            table.add("xacro_arguments", f"given for {path.name}, which is no xacro file")
-        return
-    name = nominal_kinematics(content, arguments)
+    if arguments and not takes_arguments(content):
+        table.add("xacro_arguments", f"given for {path.name}, which is no xacro file")
+    name = nominal_kinematics(content, arguments) if is_xacro(content) else ""
     if name:
         _warn_nominal(table.text("name"), name)
 

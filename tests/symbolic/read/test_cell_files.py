@@ -265,6 +265,7 @@ def test_xacro_and_packages_of_this_machine_become_part_of_the_files(
     shutil.rmtree(here)
     monkeypatch.delenv("AMENT_PREFIX_PATH")
     unpacked = unpack_cell(stored, tmp_path / "again")
+    assert load(unpacked.source).digest == unpacked.digest  # as a file of its own, too
     (address,) = robot_urdf(unpacked.robots[0]).collision_meshes
     assert "package://" not in address
     assert str(here) not in json.dumps(cell_to_json(stored))
