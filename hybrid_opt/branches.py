@@ -87,7 +87,7 @@ class BranchCompetition:
 
     @property
     def winner(self) -> tuple[int, int]:
-        """(2,) index of each robot's branch in the best pair, as in `PairResult.branches`."""
+        """(2,) index of each robot's start branch in the best pair, as in `PairResult.branches`."""
         return self.pairs[0].branches
 
     def __str__(self) -> str:

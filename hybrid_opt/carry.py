@@ -96,8 +96,8 @@ class ArmMotion:
 class Carry(Displayable):
     """A carry with its timing and every physical quantity; n samples, world frame, read-only.
 
-    Where two pieces of constant path acceleration meet there may be two samples of the same time,
-    one with the values before and one with the values after.
+    Where the path acceleration jumps there may be two samples of the same time, one with the values
+    before the jump and one with the values after it.
 
     Attributes:
         workcell: the description of the cell.

@@ -56,7 +56,8 @@ class BodyDistances:
 
     Attributes:
         bodies: bodies of the geometry, then the payload shrunk by the resting tolerance.
-        first_piece: (n_bodies + 1,) index of the first piece of each body among all pieces.
+        first_piece: (n_bodies + 1,) index of the first piece (convex solid) of each body among all
+            pieces.
         poses: (n_pieces,) index of each piece's pose in the output of the function `piece_poses`.
         shrunk_payload: index of the shrunk payload in `bodies`.
         native: the object of the C++ module; C code passes its `address` to `decide_pair`.
@@ -164,7 +165,7 @@ def _measures(shape: ConvexShape) -> tuple[int, tuple[float, float, float]]:
 
 
 class Judge:
-    """FCL objects of every piece. Each thread needs its own.
+    """FCL objects of every convex solid of the bodies. Each thread needs its own.
 
     Attributes:
         calls: number of FCL queries so far.
@@ -203,7 +204,7 @@ class Judge:
 
 
 def fcl_object(piece: Piece) -> fcl.CollisionObject:
-    """Convert a piece to an FCL object at its pose in the frame of its body."""
+    """Convert a convex solid of a body to an FCL object at its pose in the frame of the body."""
     shape = piece.shape
     match shape:
         case Box():

@@ -105,7 +105,8 @@ def joint_tables(geometry: CellGeometry) -> tuple[JointTable, ...]:
 
 
 def _in_root(body: CollisionBody, arm: ArmGeometry) -> tuple[Piece, ...]:
-    """Return the pieces of a body in a frame that does not depend on the place of the arm.
+    """Return the pieces (convex solids) of a body in a frame that does not depend on the place of
+    the arm.
 
     This is the link's frame for a moving link, and the frame of the arm's root for a fixed body.
     The poses of a fixed body's pieces are rounded.
@@ -179,7 +180,8 @@ def _reach(piece: Piece, body: CollisionBody, arm: ArmGeometry) -> Array:
 
 
 class _PieceDistances:
-    """Distances between pieces of two links of an arm as functions of two joint positions.
+    """Distances between the pieces (convex solids) of two links of an arm, as functions of two
+    joint positions.
 
     Attributes:
         still: pieces of the earlier link, in the frame of its joint or of the arm's root.
@@ -202,8 +204,8 @@ class _PieceDistances:
     def bounds(
         self, q: Array, rows: NDArray[np.intp], moving: NDArray[np.intp]
     ) -> tuple[Array, Array]:
-        """Compute lower and upper bounds (m,) [m] of the distances of moving pieces from the
-        earlier link.
+        """Compute lower and upper bounds (m,) [m] of the distances of pieces (convex solids) of the
+        later link from the earlier link.
 
         Args:
             q: (n, 2) joint positions [rad].

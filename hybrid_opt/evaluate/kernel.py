@@ -243,7 +243,8 @@ class Kernel:
         begin: Array | None,
         **choices: bool,
     ) -> list[NDArray[np.void]]:
-        """Run the kernel on the candidates of one thread; return the pairs that FCL has to decide.
+        """Run the compiled kernel on the candidates of one thread. Return the pairs of bodies that
+        the library FCL has to decide.
 
         Args:
             arrays: inputs and outputs of the kernel by name, one row per candidate.
@@ -277,7 +278,7 @@ class Kernel:
         return found
 
     def _judged(self, left: NDArray[np.void]) -> NDArray[np.bool_]:
-        """Decide by the collision checker which of n pairs collide.
+        """Decide by the collision checker which of n pairs of bodies collide.
 
         Args:
             left: (n,) records `open_pair` of the pairs that the kernel could not decide, n at least
@@ -408,7 +409,8 @@ def _definitions(geometry: CellGeometry) -> str:
 
 
 def _groups(compiled: CompiledCell) -> list[str]:
-    """Return the names of the parameter groups that the kernel takes, in order.
+    """Return the names of the groups of the cell's parameters that the compiled kernel takes, in
+    order.
 
     These are all groups except those for commanded forces (`SQUEEZES`).
     """
@@ -439,8 +441,9 @@ def configuration_size(workcell: Workcell) -> int:
 
 
 def open_pair(workcell: Workcell) -> np.dtype[np.void]:
-    """Return the record type `open_pair` of kernel.c: one pair at one sample that FCL has to
-    decide."""
+    """Return the record type `open_pair` of kernel.c: a pair of bodies at a sample whose collision
+    the library FCL has to decide.
+    """
     return np.dtype(
         [
             ("candidate", np.int64),
@@ -452,7 +455,7 @@ def open_pair(workcell: Workcell) -> np.dtype[np.void]:
 
 
 class JudgeData(ctypes.Structure):
-    """The C structure `judge_data` of kernel.c."""
+    """The C structure `judge_data` of kernel.c: pairs of bodies, and margins of their distances."""
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("pairs", "columns")),
@@ -465,7 +468,9 @@ class JudgeData(ctypes.Structure):
 
 
 class BatchData(ctypes.Structure):
-    """The C structure `batch_data` of kernel.c."""
+    """The C structure `batch_data` of kernel.c: inputs and outputs of the evaluation of a batch of
+    candidates.
+    """
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("x", "begin", "numbers")),

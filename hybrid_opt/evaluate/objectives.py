@@ -239,8 +239,8 @@ def _robust_forces(outputs: Outputs, workcell: Workcell) -> Array:
 def duration_unit(workcell: Workcell) -> float:
     """Compute the duration [s] for which the objective `duration` is 1.
 
-    It is twice the time along the straight pieces of the hand-made trajectory at the reference
-    speeds.
+    It is twice the time of the hand-made trajectory at the reference speeds, with straight motions
+    between its waypoints.
     """
     return 2.0 * workcell.task.initial_time
 

@@ -69,7 +69,7 @@ def propose_grip(
     cell: Cell, up: Range, along: Range, trials: int = TRIALS, *, progress: ShowProgress = False
 ) -> Grip:
     """Find the place of both pads on their faces at which the cell's hand-made path has the least
-    product of duration and commanded force. The path with this place is certified.
+    product of duration and commanded force. The path with this place is proven free of collisions.
 
     Args:
         cell: cell with pads on upright faces, and forces in closed form.
@@ -150,12 +150,12 @@ def _ways(workcell: Workcell) -> Array:
 
 
 def _changes(workcell: Workcell, ways: Array, at: tuple[float, float]) -> dict[str, Any]:
-    """Return the changes of the workcell file that shift all pads along their faces, by key path as
-    for `Cell.changed`.
+    """Return the changes of the workcell file that shift all pads along their faces: new values by
+    key path, as for `Cell.changed`.
 
     Args:
         workcell: the cell.
-        ways: (2, 3) unit vectors in the box frame, upwards and level.
+        ways: (2, 3) unit vectors of the upward and the level direction, box frame.
         at: shift along each of these vectors [m].
     """
     if at == (0.0, 0.0):

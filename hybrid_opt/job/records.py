@@ -155,9 +155,9 @@ class Job(Displayable):
         workcell: the cell.
         timing: timing of the carry.
         phases: phases of the job in order of time.
-        squeeze: how the commanded normal forces came about.
+        squeeze: record of how the commanded normal forces were computed.
         stands_on: names of the bodies that support the box before and after the job, two tuples;
-            empty if the box is handed over in the air.
+            empty if the box is in the air there.
         joint_names: names of each arm's joints, two tuples.
     """
 

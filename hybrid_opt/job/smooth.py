@@ -185,10 +185,10 @@ class _Slowdown:
 
 
 def _fastest(driven: Callable[[float], _Slowdown]) -> _Slowdown:
-    """Find the slowed timing with the largest factor up to 1 that satisfies the limits.
+    """Find the largest factor up to 1 on the speeds with which a timing satisfies its limits.
 
     Args:
-        driven: function that slows the timing by a factor.
+        driven: function that returns the timing slowed by a factor.
 
     Raises:
         JobError: the limits are exceeded even with the factor 0.5.

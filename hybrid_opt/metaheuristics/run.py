@@ -109,7 +109,7 @@ def make(
     settings: AlgorithmSettings | Mapping[str, object] | None = None,
     initial: Array | None = None,
 ) -> Algorithm:
-    """Build a fresh algorithm for one run.
+    """Build a search algorithm for one run.
 
     Args:
         name: name of the algorithm, one of `names()`.
@@ -120,7 +120,7 @@ def make(
 
     Raises:
         SettingsError: unknown algorithm or setting, or a value outside its range. Wrong `initial`
-            points are refused when the run starts.
+            points raise an error only when the run starts.
     """
     if is_dataclass(settings):
         settings = asdict(settings)
@@ -224,9 +224,9 @@ class CarryProblem(Problem):  # type: ignore[misc]
             evaluator: evaluator of the candidates.
             handling: 'penalty' or 'constraints', see the class.
             evaluated: function called after each batch with the number of candidates in the batch.
-            task: task of the evaluated candidates. If its path has several pieces between the
-                waypoints of the workcell file, pymoo varies only these waypoints. None varies the
-                evaluator's own variables.
+            task: task of the evaluated candidates. If it has further waypoints between those of the
+                workcell file, pymoo varies only the latter. None varies the evaluator's own
+                variables.
         """
         self.task = task if task is not None and task.pieces > 1 else None
         self.drawn = None if self.task is None else coarse_task(self.task)
@@ -396,9 +396,8 @@ def search_carries(
         rng: random generator of the whole run.
         settings: settings of the search.
         evaluated: function called after each batch with the number of candidates in the batch.
-        task: task of the candidates. If its path has several pieces between the waypoints of the
-            workcell file, only these waypoints are varied. None varies the evaluator's own
-            variables.
+        task: task of the candidates. If it has further waypoints between those of the workcell
+            file, only the latter are varied. None varies the evaluator's own variables.
 
     Returns:
         The evaluations of all candidates in order, and the generation (n,) of each, from 1.

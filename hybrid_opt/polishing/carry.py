@@ -36,23 +36,23 @@ class PlacedCarry:
     """A candidate evaluated at m places along the path, and at the task's n samples.
 
     Attributes:
-        waypoints: (n_waypoints, 6 + k) extended waypoints of a task with k redundant joints [m,
-            rad].
+        waypoints: (n_waypoints, 6 + k) box poses of the waypoints, each followed by k redundant
+            joints [m, rad].
         pose, rate: (m, 6) box poses [m, rad] and their first derivatives by the path parameter.
         q: (m, joints) joint positions of each arm [rad]; undefined from place `reached` on.
         reached: number of places before the first one out of an arm's reach.
         unreachable_arms: indices of the arms that do not reach all places.
         manipulability: (reached, 2) absolute determinant of each arm's Jacobian over its least
             allowed value.
-        split: (n, 2) both force quantities [N] of which the normal forces are branches: for soft
-            fingers both normal forces, else normal component and tangential magnitude of the
-            required force. Undefined in drivable cells and if the pads do not face each other.
+        split: (n, 2) two quantities [N] from which the normal forces follow: for soft fingers both
+            normal forces, else normal component and tangential magnitude of the required force.
+            Undefined in drivable cells and if the pads do not face each other.
         force: (n, 2) normal forces that are minimised, planned or robust [N].
         peak: (2,) largest of these forces of each robot over its reference force.
         shift: (n, 2) shifts of the centres of pressure over the patch radii.
         distances: distances of all active pairs at the places within reach.
-        gaps: function from the index of a separable pair to its gaps (reached,
-            SEPARATING_DIRECTIONS) [m].
+        gaps: function from the index of a pair of the payload and a single obstacle box to its gaps
+            along several directions (reached, SEPARATING_DIRECTIONS) [m].
     """
 
     waypoints: Array

@@ -113,7 +113,7 @@ class PolishFunctions:
         return constraint.arms(self.model)
 
     def gaps(self, pair: int, pose: Array) -> Array:
-        """Compute the gaps between payload and obstacle of a pair along all separating directions.
+        """Compute the gaps between the payload and an obstacle box along several directions.
 
         Args:
             pair: index of the pair, one of `separable`.
@@ -233,8 +233,8 @@ class Grid:
         per_sample: number of places per interval between samples.
         parameter: (m,) path parameter of all places, in [0, 1].
         sample_parameter: (n,) path parameter of the samples.
-        basis: (m, n_waypoints) matrix B: the extended poses at the places are B W for extended
-            waypoints W.
+        basis: (m, n_waypoints) matrix B: the poses at the places are B W for waypoints W, both box
+            poses with redundant joints.
         rate_basis: (m, n_waypoints) like B, for the poses' first derivatives by the path parameter.
     """
 
@@ -291,7 +291,8 @@ class SmoothCell:
         centre, half: (n_var,) middle and half range of each decision variable [m, rad, N]. Scaled
             variables xi in [-1, 1] follow from x = centre + half * xi; half is 1 for a fixed
             variable.
-        free: row and column indices of the decision variables among the extended waypoints.
+        free: row and column indices of the decision variables among the waypoints (n_waypoints, 6 +
+            m), box poses with m redundant joints.
         blocks: groups of samples that one compiled function evaluates.
         coefficients: (2, branches, 2) coefficients of the linear functions of both
             `force_quantities` whose maximum is the normal force of each contact.
@@ -345,11 +346,14 @@ class SmoothCell:
         return float(np.max(np.abs(end - start) / self.half))
 
     def waypoints(self, x: Array) -> Array:
-        """Return the extended waypoints (n_waypoints, 6 + m) [m, rad] of a decision vector x
-        (n_var,).
+        """Return the waypoints of a decision vector, as `extended_waypoints` does, but in less time
+        where no angle jumps by more than pi.
 
-        The result equals `extended_waypoints`, but takes less time where no angle jumps by more
-        than pi.
+        Args:
+            x: (n_var,) decision vector.
+
+        Returns:
+            (n_waypoints, 6 + m) box poses [m, rad] followed by m redundant joints.
         """
         points = self._fixed.copy()
         points[self.free] = x[: self._n_path]

@@ -40,7 +40,7 @@ GRASP_ROWS = 2
 
 @dataclass(frozen=True)
 class PointInequalities:
-    """The k limits that apply at every point of a driven path: linear combinations of quantities,
+    """The k limits that apply at every point of a timed path: linear combinations of quantities,
     each at most a bound.
 
     Quantities are those of `driven_layout`, followed by robust forces or by the forces that a
@@ -103,9 +103,10 @@ class IntervalGrid:
 
     Attributes:
         workcell: the cell.
-        intervals: number of pieces with constant u''.
+        intervals: number of intervals with constant path acceleration u''.
         sample: (points,) index of the grid point of each point.
-        moving: number of entries of the extended pose and its two derivatives by u, 3 (6 + m).
+        moving: number of entries, 3 (6 + m), of the extended pose (box pose followed by m redundant
+            joints) and its two derivatives by u.
         kinds: inequalities that apply at every point.
         robust: computes robust forces; None if planned ones are limited.
         layout: order of the quantities that are limited at a point.
@@ -152,8 +153,8 @@ class IntervalGrid:
         self.variables = self.layout.variables
 
     def by_path(self, slope: Array, points: NDArray[np.intp]) -> Array:
-        """Convert derivatives by the extended pose and its two path derivatives to derivatives
-        (rows, n_path) by the program's path variables.
+        """Convert derivatives by the extended pose (box pose and redundant joints) and its two path
+        derivatives to derivatives (rows, n_path) by the program's path variables.
 
         Args:
             slope: (rows, moving) derivatives of one value per row.
@@ -171,23 +172,24 @@ class IntervalGrid:
         return np.asarray(by_path @ self.spread)
 
     def path(self, waypoints: Array) -> tuple[Array, Array, Array]:
-        """Return the extended pose and its first and second derivative by u at the grid points,
-        (intervals + 1, 6 + m) each.
+        """Return the box pose followed by m redundant joints, and its first and second derivative
+        by u, at the grid points, (intervals + 1, 6 + m) each.
 
         Args:
-            waypoints: (n_waypoints, 6 + m) extended waypoints [m, rad].
+            waypoints: (n_waypoints, 6 + m) waypoints: box poses followed by m redundant joints [m,
+                rad].
         """
         first, second, third = (np.ascontiguousarray(b @ waypoints) for b in self._bases)
         return first, second, third
 
 
 class IntervalValues:
-    """Limited quantities at the points of one driven path, and their derivatives.
+    """Limited quantities at the points of one timed path, and their derivatives.
 
     Attributes:
         value: (points, quantities) values.
-        slope: (points, quantities, moving + 2) derivatives by the extended pose, its two
-            derivatives, u'' and u'^2. The joints follow the pose.
+        slope: (points, quantities, moving + 2) derivatives by the extended pose (box pose and
+            redundant joints), its two derivatives by u, u'' and u'^2. The joints follow the pose.
     """
 
     def __init__(
@@ -203,7 +205,7 @@ class IntervalValues:
         Args:
             grid: shared data.
             functions: compiled functions of the polish.
-            waypoints: (n_waypoints, 6 + m) extended waypoints [m, rad].
+            waypoints: (n_waypoints, 6 + m) box poses followed by m redundant joints [m, rad].
             squared: (intervals + 1,) u'^2 at the grid points [1/s^2].
             near: (intervals + 1, n) for each arm, joint positions near those that hold the box
                 [rad].
@@ -243,8 +245,8 @@ class IntervalValues:
             force: the force limit [N].
 
         Returns:
-            Used shares (rows,), and their derivatives (rows, moving) by the extended pose and its
-            two derivatives.
+            Used shares (rows,), and their derivatives (rows, moving) by the extended pose (box pose
+            and redundant joints) and its two derivatives by u.
         """
         begins = [values[::2] for values in self._inputs]
         still, grid = np.zeros(len(begins[-1])), self._grid
@@ -340,7 +342,8 @@ def _followed(grid: IntervalGrid, full: Array, follow: Sequence[Array]) -> Array
     Args:
         grid: shared data.
         full: (points, quantities, variables) derivatives by all variables of a point.
-        follow: for each arm, derivatives (points, pose, n) of its n joints by the extended pose.
+        follow: for each arm, derivatives (points, pose, n) of its n joints by the extended pose
+            (box pose and redundant joints).
 
     Returns:
         (points, quantities, moving + 2) derivatives by the extended pose, its two path derivatives,
@@ -522,8 +525,9 @@ class PathTimingProgram:
         return beyond
 
     def near_rows(self) -> NDArray[np.bool_]:
-        """Return a mask (points, kinds) of the timing rows that are near their bounds at the
-        iterate."""
+        """Return a mask (points, kinds) of the timing rows, the limits at points of the timing,
+        that are near their bounds at the iterate.
+        """
         rest = min(self._grid.workcell.task.force_limit[0] / self._force, 1.0)
         for_forces = (1.0 - NEARLY_USED_FORCE) * (rest - 1.0)
         threshold = np.where(self._grid.kinds.is_force, for_forces, NEARLY_USED - 1.0)
@@ -547,7 +551,8 @@ class PathTimingProgram:
         """Return the linearised rows of a step.
 
         Args:
-            chosen: (points, kinds) mask of the timing rows to include.
+            chosen: (points, kinds) mask of the timing rows (limits at points of the timing) to
+                include.
             bent: (geometric rows,) error of the rows' linear model along an earlier step, added to
                 the geometric rows.
         """

@@ -92,14 +92,14 @@ class RobustSamples:
 
 
 class RobustForces:
-    """Computes robust forces of both robots at points of a driven path of one workcell."""
+    """Computes robust forces of both robots at points of timed paths of one workcell."""
 
     def __init__(self, workcell: Workcell, pose: int) -> None:
         """Prepare the forces.
 
         Args:
             workcell: the workcell.
-            pose: number of entries of an extended pose.
+            pose: number of entries of a box pose with redundant joints.
         """
         self._forces, self._pose = robust_path(workcell), pose
         self._branches = planned_branches(workcell)
@@ -109,12 +109,13 @@ class RobustForces:
         derivatives.
 
         Args:
-            path: extended poses, and their first and second derivatives by u, (points, pose) each.
+            path: box poses followed by redundant joints, and their first and second derivatives by
+                the path parameter u, (points, pose) each.
             a, w: (points,) path acceleration u'' and squared path speed u'^2 [1/s^2].
 
         Returns:
             Forces (points, ROBUST_ROWS) [N], and their derivatives (points, ROBUST_ROWS, 3 pose +
-            2) by the extended pose, its two derivatives by u, u'' and u'^2.
+            2) by the entries of `path`, u'' and u'^2.
         """
         pose, first, second = (np.ascontiguousarray(part[:, :6]) for part in path)
         force, slope = self._forces.most_demanding(
@@ -129,7 +130,7 @@ class RobustForces:
         return force.reshape(n, ROBUST_ROWS), found
 
     def planned_weights(self, weight: Array, value: Array) -> Array:
-        """Replace the multipliers of robust forces by multipliers of the planned forces' branches.
+        """Replace the multipliers of robust forces by multipliers of planned forces.
 
         The Hessian of a Lagrangian with these multipliers has the curvature of planned forces in
         place of the curvature of robust forces.

@@ -89,8 +89,9 @@ class PolishSettings:
     """All settings that decide the results of a polish.
 
     Attributes:
-        attempts: number of attempts at points, ends and middle of a front; probes and attempts in
-            gaps are extra. For drivable carries the number of force limits of the sweep.
+        attempts: number of attempts at points, ends and middle of a front; probes (short solves far
+            from the front) and attempts in gaps are extra. For drivable carries the number of force
+            limits of the sweep.
         solver: solver of the programs that minimise both peak forces: the dense
             interior-point method of `hybrid_opt.polishing.solvers.dense`, or IPOPT.
         rounds: largest number of trust-region iterations at one point.

@@ -155,7 +155,7 @@ class GoverningCases:
     leading_share: float
 
     def at(self, rows: NDArray[np.intp]) -> GoverningCases:
-        """Return the governing cases at some of the samples.
+        """Return the cases that decide the forces at some of the samples.
 
         Args:
             rows: (m,) indices of the samples.

@@ -206,7 +206,8 @@ class RobustModel:
     ) -> None:
         """Load or build the compiled functions that compute robust forces.
 
-        They are loaded at once if the contact model has a scalar squeeze, else on first use.
+        They are loaded at once if the normal force of one pad determines that of the other pad,
+        else on first use.
 
         Args:
             workcell: the workcell.

@@ -152,7 +152,8 @@ class RobustPath:
             level: (n,) normal force at each point [N].
 
         Returns:
-            Indices of the points found, and the governing cases at these points.
+            Indices of the points found; and the governing cases, which need the largest force, at
+            these points.
         """
         n, k = len(points), len(self._cases)
         every, cases = tile_motion(points.motion, k), np.repeat(self._cases, n, axis=0)
@@ -201,7 +202,8 @@ class RobustPath:
         return force, slope
 
     def slopes(self, points: PathPoints, governing: GoverningCases) -> Array:
-        """Compute the derivatives of both robots' normal forces in the governing cases.
+        """Compute the derivatives of both robots' normal forces in the governing cases, which need
+        the largest force.
 
         Args:
             points: n points of paths.
@@ -254,7 +256,7 @@ class GoverningForce:
     """
 
     def __init__(self, carry: Carry, leader: int) -> None:
-        """Find the governing cases of a carry.
+        """Find the cases of the uncertainty that need the largest commanded force along a carry.
 
         Args:
             carry: the carry.
@@ -308,7 +310,8 @@ class GoverningForce:
         return self._inputs(self._workcell, self._motion, pads=True)
 
     def _inputs(self, cell: Workcell, motion: BoxMotion, pads: bool) -> Array:
-        """Compute the m inputs of `_gradient` in another cell, for each of the k governing cases.
+        """Compute the m inputs of `_gradient` in another cell, for each of the k governing cases,
+        which need the largest force.
 
         Args:
             cell: the other cell.
@@ -336,8 +339,8 @@ class GoverningForce:
 
     @cached_property
     def _gradient(self) -> Array:
-        """Gradient (k, 2, m) of the force in each of k governing cases with respect to the m inputs
-        of `_inputs`.
+        """Gradient (k, 2, m) of the force in each of the k cases that need the largest force, with
+        respect to the m inputs of `_inputs`.
 
         The second axis has the gradients with the friction coefficient of robot 0, and of robot 1,
         slightly lowered: the lower coefficient decides how the force between the arms is shared.

@@ -24,8 +24,8 @@ class PathLimits:
     """Limits at n samples of a path as functions of u'' and u'^2, each divided by its bound.
 
     Limits on speeds are not among them; `squared_speed_limit` computes these. Robust forces are
-    part of `forces` if the contact model has a scalar squeeze (`ContactModel.has_scalar_squeeze`),
-    else of `ratios`.
+    part of `forces` if the normal force of one pad determines that of the other pad
+    (`ContactModel.has_scalar_squeeze`), else of `ratios`.
 
     Attributes:
         motion: geometry of the path at the samples.
@@ -86,8 +86,8 @@ class PathLimits:
     def ratios(self, a: Array, w: Array) -> Array:
         """Compute the limited quantities that are not convex in (u'', u'^2), over their limits.
 
-        These are joint torques with sign, pressure shifts and, without a scalar squeeze, robust
-        forces.
+        These are joint torques with sign, pressure shifts and, unless the normal force of one pad
+        determines that of the other pad, robust forces.
 
         Args:
             a, w: (n,) values of u'' [1/s^2] and u'^2 [1/s^2].

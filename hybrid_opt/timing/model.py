@@ -339,9 +339,10 @@ class TimingModel:
         return self._latest
 
     def path_coefficients(self, motion: PathMotion) -> dict[str, Array]:
-        """Return the input of the compiled passes for one path: coefficients of the limits and
-        extended poses with two derivatives by u, at both ends and in the middle of every interval.
-        It is the argument `paths` of `ForwardBackwardPasses.time` with n = 1."""
+        """Return the coefficients of the limits of one path, and the box poses with redundant
+        joints and their two derivatives by u, at both ends and in the middle of every interval. It
+        is the argument `paths` of `ForwardBackwardPasses.time` for one path.
+        """
         task, some = self.workcell.task, slice(None, None, REFINEMENT // 2)
         box = (motion.pose, motion.pose_first, motion.pose_second)
         joints = (motion.q, motion.q_first, motion.q_second)

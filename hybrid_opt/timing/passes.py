@@ -86,10 +86,10 @@ class ForwardBackwardPasses:
         self._has_scalar_squeeze = command_model(self.workcell).has_scalar_squeeze
 
     def supports(self, limits: TimingLimits) -> bool:
-        """Return True if the passes can impose these limits.
+        """Return True if the backward and forward pass can respect these limits.
 
-        They cannot impose robust force limits of a contact model without a scalar squeeze
-        (`ContactModel.has_scalar_squeeze`).
+        They cannot respect limits on robust forces unless the normal force of one pad determines
+        that of the other pad (`ContactModel.has_scalar_squeeze`).
         """
         return self._has_scalar_squeeze or not limits.robust
 
@@ -201,14 +201,14 @@ class RobustCuttingPlanes:
         self._share = np.tile([0.0, 0.5, 1.0], self._intervals)
 
     def time(self, threads: int) -> tuple[dict[str, Array], list[AtRest | None]]:
-        """Time all paths.
+        """Compute the fastest timings of all paths.
 
         Args:
             threads: number of threads that share the paths.
 
         Returns:
-            Outputs of the passes by name; and for each path its largest robust forces at rest and
-            their sample if these exceed the force limit, else None.
+            Outputs of the compiled backward and forward pass by name; and for each path its largest
+            robust forces at rest and their sample if these exceed the force limit, else None.
         """
         still = self._at_rest()
         out = self._passes.batch(self._rows, self._options, self._cuts, threads=threads)
@@ -248,7 +248,8 @@ class RobustCuttingPlanes:
         return found
 
     def _cut(self, chosen: NDArray[np.intp], squared: Array) -> NDArray[np.bool_]:
-        """Add supporting lines where timings exceed the robust force limits of their paths.
+        """Add supporting lines (tangents that bound the robust forces) where timings exceed the
+        force limits of their paths.
 
         Args:
             chosen: (m,) indices of paths.

@@ -45,12 +45,13 @@ PATH_INTERVALS = 100
 class PathTimer:
     """Computes the fastest timings of paths of one workcell.
 
-    Limits that the compiled passes do not support are left to `time_path`, which is slow.
+    They are computed by a compiled backward and forward pass over the path. Limits that it does not
+    support are left to `time_path`, which is slow.
 
     Attributes:
         workcell: the workcell.
         intervals: number of intervals of constant path acceleration.
-        passes: the compiled passes.
+        passes: the compiled backward and forward pass.
     """
 
     def __init__(

@@ -268,7 +268,7 @@ class PathTiming:
             if the path itself fails.
         grid_speed: (intervals + 1,) path speed u' at the grid points [1/s]; zero if there is no
             timing.
-        sweeps: iterations of both passes.
+        sweeps: iterations of the backward and forward pass.
         slowed: uniform factor on the path speed, below one if only this made the limits hold.
         robust_force: (2,) like `peak_force`, but over all cases of the workcell's uncertainty; None
             if robust forces are not limited.

@@ -50,9 +50,9 @@ def time_path(
     """Compute the fastest timing from rest to rest within the workcell's limits and additional
     ones.
 
-    The compiled passes compute it. Limits that they do not support are left to
-    `hybrid_opt.timing.topp_ra`, which is many times slower. The timing is checked on a finer grid,
-    and slowed down uniformly if it exceeds a limit there.
+    A compiled backward and forward pass over the path computes it. Limits that this method does not
+    support are left to `hybrid_opt.timing.topp_ra`, which is many times slower. The timing is
+    checked on a finer grid, and slowed down uniformly if it exceeds a limit there.
 
     Args:
         model: timing model of the workcell.
@@ -155,7 +155,7 @@ def _slow_down(
         model: timing model of the workcell.
         motion: geometry of the path.
         limits: limits in addition to the workcell's.
-        found: timing by the passes or by TOPP-RA.
+        found: the timing to check, by either method.
     """
 
     @cache

@@ -392,7 +392,8 @@ def _load(cell: Cell) -> NumericFunction:
     """Return the compiled function that computes the contact forces from pose, velocity and
     acceleration of the box.
 
-    The function is loaded alone, because a timing model would also load its compiled passes.
+    The function is loaded alone, because a timing model would also load its compiled solver of
+    timings.
 
     Args:
         cell: the cell.

@@ -236,7 +236,7 @@ def _empty(run: Recording, pieces: list[MeasuredHold], evidence: Evidence) -> No
 
     Args:
         run: the run.
-        pieces: still pieces of the run.
+        pieces: measurements of the parts of the run in which the arms are still.
         evidence: the results, to which the force is added.
     """
     if not pieces:

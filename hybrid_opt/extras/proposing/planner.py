@@ -500,7 +500,7 @@ def retreats(chain: ClosedChain, ends: tuple[ChainConfiguration, ChainConfigurat
     Directions are the world's axes and the diagonals between them.
 
     Args:
-        chain: both arms with a fixed hold each.
+        chain: both arms, whose pads stay fixed on the box.
         ends: configurations at the start and at the goal.
 
     Returns:
@@ -527,7 +527,7 @@ def straight_paths(
     of directions gives at most one path.
 
     Args:
-        chain: both arms with a fixed hold each.
+        chain: both arms, whose pads stay fixed on the box.
         out: result of `retreats`: configurations along straight motions out of start and goal.
         box: collision checker of the box alone.
 
@@ -571,7 +571,7 @@ def plan(
     found.
 
     Args:
-        chain: both arms with a fixed hold each.
+        chain: both arms, whose pads stay fixed on the box.
         out: result of `retreats`: configurations along straight motions out of start and goal. They
             become further roots of the planner's trees.
         room: box poses and redundant joints that the path may use.

@@ -140,11 +140,11 @@ def _free(judge: PoseJudge, *places: ChainConfiguration) -> bool:
 
 
 def _free_share(chain: ClosedChain, start: ChainConfiguration, goal: ChainConfiguration) -> float:
-    """Compute the largest share of a box path from `GUIDES` that both arms can follow without
-    collision, from start and goal together.
+    """Compute the share of a box path that both arms can follow without collision, from start and
+    goal together; the largest of all paths in `GUIDES`.
 
     Args:
-        chain: both arms with a fixed hold each.
+        chain: both arms, whose pads stay fixed on the box.
         start: configuration at the start.
         goal: configuration at the goal.
     """

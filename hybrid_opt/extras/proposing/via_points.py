@@ -88,7 +88,7 @@ def remove_corners(
     """Shorten a path by straight motions between random places on it.
 
     Args:
-        chain: both arms with a fixed hold each.
+        chain: both arms, whose pads stay fixed on the box.
         corners: corners of a collision-free path.
         rng: generator that chooses the places.
 
@@ -126,7 +126,7 @@ def fit(
     interpolations between these two, and random shifts of the best.
 
     Args:
-        chain: both arms with a fixed hold each.
+        chain: both arms, whose pads stay fixed on the box.
         path: configurations from start to goal.
         count: number of via-points.
         rng: generator of the shifts.
@@ -173,10 +173,11 @@ def shorten_spline(
     An evolution strategy, CMA-ES (Hansen, arXiv 1604.00772), starts from the given waypoints.
 
     Args:
-        chain: both arms with a fixed hold each.
+        chain: both arms, whose pads stay fixed on the box.
         start: configuration at the first waypoint.
         waypoints: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m],
             start and goal included.
+        rng: generator that seeds the strategy.
 
     Returns:
         (n, 6 + m) waypoints; the given ones if none better are found.
@@ -221,7 +222,7 @@ def _closed_path(
     Collisions are ignored.
 
     Args:
-        chain: both arms with a fixed hold each.
+        chain: both arms, whose pads stay fixed on the box.
         start: configuration at the first pose.
         path: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
     """
@@ -240,7 +241,7 @@ def _lengths(chain: ClosedChain, paths: Array, near: tuple[Array, Array]) -> tup
     parts.
 
     Args:
-        chain: both arms with a fixed hold each.
+        chain: both arms, whose pads stay fixed on the box.
         paths: (k, n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
         near: joint positions (n, joints) of each arm along a similar path, from which the solution
             starts [rad or m].
@@ -266,7 +267,7 @@ def free_share(chain: ClosedChain, start: ChainConfiguration, waypoints: Array) 
     cannot hold the box.
 
     Args:
-        chain: both arms with a fixed hold each.
+        chain: both arms, whose pads stay fixed on the box.
         start: configuration at the first waypoint.
         waypoints: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
     """

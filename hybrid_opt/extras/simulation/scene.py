@@ -334,8 +334,9 @@ def patch_area(contact: Contact) -> float:
 def pressed_places(contact: Contact, pads: Pads, points: int) -> Array:
     """Compute the points (n, 2) of a patch that press on the payload, in the plane of the pad [m].
 
-    Points of driven pads lie evenly around the rim of a round patch, or at the corners of a
-    rectangle. The corners can carry every load of the sides, with the largest lever for torsion.
+    Points of pads of the kind 'driven' lie evenly around the rim of a round patch, or at the
+    corners of a rectangle. The corners can carry every load of the sides, with the largest lever
+    for torsion.
 
     Args:
         contact: the pad.

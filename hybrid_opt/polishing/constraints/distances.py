@@ -249,7 +249,7 @@ class AxisSwitchGaps(DistanceConstraintKind):
 
 @dataclass(frozen=True)
 class Gaps:
-    """Gaps of a separable pair along n directions at m places.
+    """Gaps between the payload and an obstacle box along n directions, at m places of the path.
 
     Attributes:
         along: (m, n) gap between payload and obstacle along each direction [m].

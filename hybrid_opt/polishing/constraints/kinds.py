@@ -170,8 +170,8 @@ class Forces(ConstraintKind[ForceRow]):
         yield from self._other_branches(carry)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[ForceRow]:
-        """Return rows for those branches of the normal forces that have no rows along the whole
-        path.
+        """Return rows for branches (linear functions whose maximum is the normal force) other than
+        the one with rows along the whole path.
 
         They lie at samples where such a branch is the largest, or nearly so.
 
@@ -198,7 +198,9 @@ class Forces(ConstraintKind[ForceRow]):
         }
 
     def _values(self, carry: PlacedCarry) -> Array:
-        """Compute the normal forces (samples, 2, branches) of both robots by every branch [N]."""
+        """Compute every branch (linear function whose maximum is the normal force) of both robots,
+        (samples, 2, branches) [N].
+        """
         return np.asarray(np.einsum("rbk,nk->nrb", self.cell.coefficients, carry.split))
 
     def _peaks(self, carry: PlacedCarry) -> set[int]:
@@ -214,8 +216,8 @@ class Forces(ConstraintKind[ForceRow]):
         return {int(k) for k in (tops[:, None] + np.array([-1, 0, 1])).ravel()}
 
     def _other_branches(self, carry: PlacedCarry) -> list[ForceRow]:
-        """Return force rows for all branches except the one with tight friction cones, at samples
-        where they are the largest or nearly so.
+        """Return force rows for branches (linear functions whose maximum is the normal force) other
+        than the one with tight friction cones, at samples where they are the largest or nearly so.
 
         The list is empty for robust forces, and for forces that a convex program computes. Such
         forces have one row per robot and sample.
