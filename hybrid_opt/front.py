@@ -264,7 +264,7 @@ def select(
     Args:
         evaluator: evaluator of the cell's candidates.
         x: (k, n_var) decision vectors of the front.
-        rows: (k,) values of `SelectedCarry.row` for the carries, None for 0 to k - 1.
+        rows: (k,) index of each carry, for `SelectedCarry.row`; None for 0 to k - 1.
     """
     if len(x) == 0:
         return None

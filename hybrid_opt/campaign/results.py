@@ -181,8 +181,8 @@ class CampaignResults:
     def to_polish(self) -> tuple[Front, ...]:
         """Fronts from which the polish starts.
 
-        These are the fronts of all replicas. In a drivable experiment it is a single front,
-        `UNION`, of the non-dominated candidates of all replicas.
+        These are the fronts of all replicas. For a drivable cell it is a single front, called
+        `UNION`, of the non-dominated candidates of all replicas together.
         """
         if not self.workcell.task.law.is_drivable:
             return self.searched
@@ -193,7 +193,7 @@ class CampaignResults:
     def fronts(self) -> tuple[Front, ...]:
         """Fronts of all replicas, each followed by its polished front if there is one.
 
-        The polished front of the union of all replicas comes last, if there is one.
+        The polished front of all replicas together comes last, if there is one.
 
         Raises:
             ResultsError: the file of a polished front is damaged.
@@ -204,10 +204,11 @@ class CampaignResults:
         return tuple(front for front in (*found, self.polished(UNION)) if front is not None)
 
     def polished(self, algorithm: str, replica: int = 0) -> Front | None:
-        """Return the polished front of a replica or of the union; None if it was not polished.
+        """Return the polished front of a replica, or of all replicas together; None if it was not
+        polished.
 
         Args:
-            algorithm: name of the algorithm, or `UNION`.
+            algorithm: name of the algorithm; `UNION` for all replicas together.
             replica: number of the replica, from 0.
 
         Raises:

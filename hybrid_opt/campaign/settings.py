@@ -34,7 +34,7 @@ SIZE_KEYS = ("population", "swarm", "batch")
 
 
 def sized(algorithm: str, size: int) -> dict[str, Any]:
-    """Return the settings by name with which an algorithm evaluates `size` candidates per
+    """Return the settings, values by name, with which an algorithm evaluates `size` candidates per
     generation.
     """
     known = asdict(metaheuristics.settings_of(algorithm))

@@ -152,7 +152,8 @@ class _Sweep:
         return MotionVerdict("free", None)
 
     def _first_intervals(self) -> Intervals:
-        """Return the intervals between samples for which motion bounds give no proof.
+        """Return the intervals between samples in which bounds of the bodies' motion do not prove
+        freedom from collisions.
 
         Motions are handled one by one: nearly all intervals are proven free, and arrays over all of
         them would not stay in the processor's cache.
@@ -186,11 +187,11 @@ class _Sweep:
         return Intervals(index, start, width, a, b, *self.checker.motion(*ends), pending)
 
     def _uncleared(self, work: Intervals) -> Intervals:
-        """Return those of the given intervals in which a pair is not yet proven to keep the
-        required distance.
+        """Return those of the given intervals in which a pair of bodies is not yet proven to keep
+        its required distance.
 
-        The proof is one of the two bounds that the module's documentation describes. Pairs with a
-        proof are no longer `pending`.
+        A proof succeeds if the pair's distances at both ends are large enough for its relative
+        motion between them. Pairs with a proof are no longer `pending`.
         """
         c_a, c_b = work.a.clearance, work.b.clearance
         halfway = c_a + c_b
@@ -275,7 +276,7 @@ class _Sweep:
 
 
 class Rows:
-    """A record of arrays with one row per item. A field may be a record of this kind as well."""
+    """A record of arrays with one row per item. A field may itself be such a record."""
 
     def __getitem__(self, rows: NDArray[np.bool_]) -> Self:
         return of_rows(lambda values: values[0][rows], [self])

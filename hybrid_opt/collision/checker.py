@@ -79,7 +79,8 @@ class CollisionChecker:
         judge: FCL objects of these bodies.
         functions: functions by name of `symbolic.geometry.clearance.screening_functions`, compiled
             or interpreted.
-        free_beyond: (n_pairs,) a pair is free if its lower bound exceeds this distance [m].
+        free_beyond: (n_pairs,) distance [m]; a pair of bodies is free if the lower bound of its
+            distance exceeds it.
         resting_places: places at which the payload may rest on a body of the environment, one for
             each allowed contact and fixed pose that touches the body: index of the pair, box centre
             (3,) [m], and departure [m].
@@ -107,7 +108,8 @@ class CollisionChecker:
         return first, second, third
 
     def bounds(self, pose: Array, q_1: Array, q_2: Array) -> Array:
-        """Compute a lower bound (n, n_pairs) [m] of the distance of every active pair.
+        """Compute a lower bound (n, n_pairs) [m] of the distance of every pair of bodies that is
+        checked.
 
         Args:
             pose: (n, 6) box poses [m, rad].
@@ -124,7 +126,7 @@ class CollisionChecker:
 
     @cached_property
     def tables(self) -> tuple[JointTable, ...]:
-        """Tables of lower bounds of some active pairs by joint positions."""
+        """Tables of lower bounds of the distances of some pairs of bodies by joint positions."""
         return joint_tables(self.geometry)
 
     def check(self, pose: Array, q_1: Array, q_2: Array, clearance: Array | None = None) -> Verdict:
@@ -303,7 +305,7 @@ class CollisionChecker:
     def _bodies(
         self, pairs: NDArray[np.intp], resting: NDArray[np.bool_]
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return the indices (m,) of the first and of the second body of each pair.
+        """Return the indices (m,) of the first and of the second body of each pair of bodies.
 
         Args:
             pairs: (m,) indices of active pairs.
@@ -351,7 +353,8 @@ class CollisionChecker:
     def _resting(
         self, pose: Array, rows: NDArray[np.intp], pairs: NDArray[np.intp]
     ) -> NDArray[np.bool_]:
-        """Find the queries in which the box may rest on the other body of the pair.
+        """Find the queries, each for one pair of bodies at one sample, in which the box may rest on
+        the other body of the pair.
 
         Args:
             pose: (n, 6) box poses [m, rad].
@@ -368,7 +371,9 @@ class CollisionChecker:
         return found
 
     def _find_resting(self) -> list[tuple[int, Array, float]]:
-        """Compute the entries of `resting_places`."""
+        """Find the places at which the payload may rest on a body: index of the pair, box centre
+        (3,) [m] and departure [m] of each, as in `resting_places`.
+        """
         task = self.geometry.workcell.task
         pairs = {names: k for k, names in enumerate(self._names)}
         found = []

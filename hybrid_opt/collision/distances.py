@@ -146,7 +146,7 @@ def shape_table(
 
 
 def _measures(shape: ConvexShape) -> tuple[int, tuple[float, float, float]]:
-    """Return the kind and the sizes [m] of a shape as `distances.cpp` numbers them."""
+    """Return the kind and the sizes [m] of a convex shape in the numbering of `distances.cpp`."""
     match shape:
         case Box():
             x, y, z = (float(length) / 2.0 for length in shape.size)

@@ -51,10 +51,10 @@ MOST_ANGLE = 1e6
 
 @dataclass(frozen=True)
 class JointTable:
-    """Table of lower bounds of the distance of one active pair.
+    """Table of lower bounds of the distance of one pair of bodies.
 
     Attributes:
-        pair: index of the pair among the active pairs.
+        pair: index of the pair among all pairs that are checked.
         robot: index of the arm.
         joint: index of the first of the two joints between the bodies; the second follows it.
         bounds: (CELLS, CELLS) lower bounds by cells of the first and of the second joint [m]; -1 in
@@ -82,7 +82,8 @@ class JointTable:
 
 
 def joint_tables(geometry: CellGeometry) -> tuple[JointTable, ...]:
-    """Build tables for pairs that compiled bounds often cannot decide.
+    """Build tables of lower bounds of distances for pairs of bodies that compiled bounds often
+    cannot decide.
 
     Both joints between the bodies of such a pair turn and belong to one arm. A body has a hull. The
     bodies are close in many postures, or the arm is mounted on the earlier body.

@@ -129,7 +129,7 @@ def force_range(driver: CandidateDriver) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class DriveIterate(Iterate):
-    """An iterate of a drivable carry; its level is the duration [s].
+    """An iterate of a drivable carry; its level, the value that is minimised, is the duration [s].
 
     Attributes:
         joints: (intervals + 1, n) joint positions of each arm at the grid points of the timing

@@ -188,7 +188,11 @@ def scalarisation_for(anchor: Array, span: Array, objective: int | None) -> Scal
 
 
 class ForceProgram:
-    """The nonlinear program of the module's formula, with chosen rows, near one candidate.
+    """Nonlinear program that minimises a scalarisation of both peak forces near one candidate, with
+    chosen rows (scalar inequalities).
+
+    Its variables z are the decision variables scaled to [-1, 1], both scaled peak forces, and the
+    level that bounds them.
 
     Attributes:
         layout: order of the rows.
@@ -325,8 +329,9 @@ class ForceProgram:
         return optimality_residuals(self, z, (low, high))
 
     def candidate(self, z: Array) -> Array:
-        """Return the decision vector (n_var,) that z (n_variables,) contains, clipped to its bounds
-        and to the trust region."""
+        """Return the decision vector (n_var,) in the program's variables z (n_variables,), clipped
+        to its bounds and to the trust region.
+        """
         n = self._n
         return self._cell.unscaled(np.clip(z[:n], self.low[:n], self.high[:n]))
 

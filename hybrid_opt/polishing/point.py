@@ -72,7 +72,7 @@ class TrustRegion:
         return self.radius < self._least
 
     def is_step_bounded(self, length: float) -> bool:
-        """Return True if the box limited a step.
+        """Return True if the trust region limited a step.
 
         Args:
             length: largest change of a scaled variable in the step.

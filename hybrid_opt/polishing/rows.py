@@ -183,7 +183,8 @@ def _all_directions(second: NumericFunction, n: int, n_var: int) -> PreparedBatc
 
 
 class ConstraintRows:
-    """Values and derivatives of a program's rows by x (n_var,) and k further variables, the tail.
+    """Values of a program's rows (scalar inequalities), and their derivatives by x (n_var,) and by
+    k further variables, the tail.
 
     The value of row r is offset_r + fixed_r . tail + own_r(x). For a force row own_r is mix_r times
     the two force quantities of its sample; for a pressure row the unused share of the patch; for a
@@ -376,7 +377,8 @@ class ConstraintRows:
 
     def slopes(self) -> Array:
         """Return the derivatives (n_rows, n_var + k) of all rows by x and the k further variables,
-        at the last x of `values`."""
+        at the x for which `values` was called last.
+        """
         return np.asarray(self._native.slopes())
 
     def curvature(self, multipliers: Array) -> Array:
@@ -394,19 +396,23 @@ class ConstraintRows:
 
     @property
     def forces(self) -> Array:
-        """The two force quantities (n_forces, 2) [N] of each force row's sample at the last x."""
+        """The two quantities (n_forces, 2) [N] from which normal forces follow, at the sample of
+        each force row and the last evaluated x.
+        """
         return self._forces.found[self._column]
 
     @property
     def force_slopes(self) -> Array:
         """The derivatives (n_forces, 2, n_var) of `forces` by x; undefined if a convex program
-        computes the forces."""
+        computes the forces.
+        """
         return self._forces.gradients[self._column]
 
     @property
     def left(self) -> Array:
-        """The unused shares of the patches (n_patches,) at the last x: one less the square of the
-        pressure shift over the patch radius."""
+        """The unused share (n_patches,) of the patch for each pressure row, at the last evaluated
+        x: one less the square of the pressure shift over the patch radius.
+        """
         return self._patches.found.ravel()[self._pressed]
 
     def correct_forces(self, slope: Array, x: Array) -> None:

@@ -95,7 +95,7 @@ class Wish:
 
     @property
     def target(self) -> str:
-        """The target of the wish as a text."""
+        """The user's target as a text."""
         if self.duration is not None:
             return f"the least force of all carries of at most {self.duration:g} s"
         if self.force is not None:
@@ -381,7 +381,7 @@ def ranked(options: Sequence[Option], goal: Goal) -> list[Option]:
 def best_of_paths(
     paths: DrivenPaths, options: Sequence[Option], goal: Goal, most: int
 ) -> Iterator[Option]:
-    """Yield the cheapest timing of each of the best paths that keeps the limits of a goal, cheapest
+    """Yield the best paths that keep the limits of a goal, each with its cheapest timing, cheapest
     first.
 
     Force limits between those of the given timings are tried as well.

@@ -77,7 +77,7 @@ class Recommendation(Displayable):
     """The recommended carry, with its forces, its job and the reasons for it.
 
     Attributes:
-        wish: target of the recommendation.
+        wish: the user's target of the recommendation.
         member: index of the carry's path in the front.
         x: (n_var,) decision vector: the path, then the force limit [N].
         timing: timing of the carry within all limits, jerk limits included, without jumps of

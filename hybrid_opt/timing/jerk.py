@@ -161,8 +161,9 @@ class _JerkProblem:
         return replace(self._checked_timing(c), rounds=rounds)
 
     def _iterate(self, c: Array) -> tuple[Array, int]:
-        """Solve programs from feasible coefficients c (k,) until the duration settles. Return the
-        last coefficients (k,) and the number of programs solved."""
+        """Solve programs from feasible spline coefficients c (k,) until the duration settles.
+        Return the last coefficients (k,) and the number of programs solved.
+        """
         duration = self._coarse.duration(c)
         for rounds in range(1, MAX_JERK_ITERATIONS + 1):
             found = self._step(c)
@@ -175,7 +176,7 @@ class _JerkProblem:
         return c, rounds
 
     def _step(self, c: Array) -> Array | None:
-        """Solve one program about coefficients c (k,).
+        """Solve one program about spline coefficients c (k,) of the squared speed.
 
         Returns:
             Coefficients (k,) with a shorter duration that satisfy all limits at the coarse points;
@@ -252,8 +253,9 @@ class _JerkProblem:
             rows.add_norm_bounds(box, np.zeros((len(v), 3)), head, level, at.first_basis)
 
     def _excess(self, c: Array) -> Array:
-        """Compute for each of n coarse points the largest utilisation (n,) of any limit at the
-        finer points next to it, with coefficients c (k,)."""
+        """Compute the largest utilisation (n,) of any limit at the finer points beside each of n
+        coarse points, for spline coefficients c (k,) of the squared speed.
+        """
         carry = self._model.carry(self._fine.motion, *self._fine.profile(c))
         ratios = self._model.carry_limits.ratios(carry, self._limits)
         del ratios[FRICTION_RATIO]
@@ -274,7 +276,8 @@ class _JerkProblem:
         return factor
 
     def _jerks(self, at: WarpedPath, c: Array) -> tuple[Array, Array]:
-        """Compute jerks over their limits at each of n points, with coefficients c (k,).
+        """Compute jerks over their limits at n points, for spline coefficients c (k,) of the
+        squared speed.
 
         Returns:
             The largest joint jerk and the payload jerk at each point, (n,) each.
@@ -290,8 +293,9 @@ class _JerkProblem:
         return timing, most_used(timing.use).ratio, joint, box
 
     def _use_by_factor(self, c: Array) -> Callable[[float], float]:
-        """Return a function that maps a factor on all speeds to the largest utilisation of any
-        limit on the finer grid, with coefficients c (k,)."""
+        """Return the function from a factor on all speeds to the largest utilisation of any limit
+        on the finer grid, for spline coefficients c (k,) of the squared speed.
+        """
         jerk = max(float(jerk.max()) for jerk in self._jerks(self._fine, c))
 
         def use(f: float) -> float:
@@ -302,8 +306,9 @@ class _JerkProblem:
         return use
 
     def _checked_timing(self, c: Array) -> JerkTiming:
-        """Check the timing with coefficients c (k,) on the finer grid, and slow it down uniformly
-        if it exceeds a limit there."""
+        """Check the timing with spline coefficients c (k,) on the finer grid, and slow it down
+        uniformly if it exceeds a limit there.
+        """
         factor = largest_speed_factor(self._use_by_factor(c))
         timing, *uses = self._check(self._fine, factor**2 * c)
         status = TimingStatus.OK if factor >= LEAST_SPEED_FACTOR else TimingStatus.NOT_CONVERGED
@@ -317,8 +322,8 @@ class _JerkProblem:
 
 @dataclass(frozen=True)
 class WarpedPath:
-    """A path at n samples of its warped parameter s, with linear maps from spline coefficients to
-    the motion there.
+    """A path at n samples of its warped parameter s, u = s^3 (10 - 15 s + 6 s^2), with linear maps
+    from spline coefficients to the motion there.
 
     The k coefficients c are those of v = s'^2, a cubic spline in s.
 
@@ -396,8 +401,9 @@ class WarpedPath:
         return np.take_along_axis(values, self.columns.reshape(shape), axis=-1)
 
     def duration(self, c: Array) -> float:
-        """Compute the duration [s] with coefficients c (k,) by Simpson's rule, for an odd number of
-        samples."""
+        """Compute the duration [s] with spline coefficients c (k,) of the squared speed by
+        Simpson's rule, for an odd number of samples.
+        """
         return float(self._weights() @ (1.0 / np.sqrt(np.maximum(self.value @ c, 1e-300))))
 
     def _weights(self) -> Array:
@@ -406,7 +412,7 @@ class WarpedPath:
         return weights / (3.0 * (len(self.s) - 1))
 
     def profile(self, c: Array) -> tuple[Array, Array, Array]:
-        """Compute the motion along the path with coefficients c (k,).
+        """Compute the motion along the path with spline coefficients c (k,) of the squared speed.
 
         Returns:
             Times [s] of the samples, path speeds u' [1/s] and path accelerations u'' [1/s^2], (n,)

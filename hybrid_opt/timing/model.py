@@ -64,7 +64,9 @@ class PathMotion:
         parameter: (n,) u in [0, 1].
         pose: (n, 6) box poses [m, rad].
         q: (n, all joints) joint positions [rad].
-        lost, limit_margin, manipulability: (n, 2) quantities of both arms.
+        lost: (n, 2) 0 while each arm has reached all samples up to here, else 1.
+        limit_margin: (n, 2) least distance of each arm's joints from their limits [rad].
+        manipulability: (n, 2) absolute determinant of each arm's Jacobian [m^3].
     """
 
     x: Array
@@ -434,7 +436,7 @@ class TimingModel:
 
     def contact_torque(self, wrench_torque: Array, load: Mapping[str, Array]) -> Array:
         """Compute the joint torques (n, all joints) [N m] that exert the contact wrenches in
-        `load`, the outputs of `load`, with the matrices (n, all joints, 6) `wrench_torque`.
+        `load`, a result of the method `load`, with the matrices `wrench_torque` (n, all joints, 6).
         """
         wrenches = (load["wrench_1"], load["wrench_2"])
         return contact_torque(len(self.joint_names[0]), wrench_torque, wrenches)
@@ -485,7 +487,7 @@ class TimingModel:
         return TimingLimits(force=force, robust=self.is_robust)
 
     def checked(self, x: Array) -> Array:
-        """Return a decision vector (n_var,) as an array.
+        """Check the shape of a decision vector (n_var,) and return it as an array.
 
         Raises:
             SettingsError: x does not fit the workcell.

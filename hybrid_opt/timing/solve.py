@@ -203,7 +203,7 @@ def check_limits(
     limits: TimingLimits,
     ratios: Mapping[str, Array] | None = None,
 ) -> Timing:
-    """Compute the utilisation of every limit by a carry.
+    """Compute how far a carry uses every limit: the largest ratio of value to limit.
 
     Args:
         model: timing model of the workcell.

@@ -293,7 +293,7 @@ class Export:
 
     @property
     def follower(self) -> int:
-        """Index of the force-controlled arm of pads that press."""
+        """Index of the force-controlled arm, for pads that press the box between them."""
         return 1 - self.job.squeeze.leader
 
     @property
@@ -414,7 +414,7 @@ class Export:
 
     @cached_property
     def partner_stop(self) -> PartnerStop:
-        """Effect of an unplanned stop of one arm.
+        """Effect of an unplanned stop of one arm on the place of the pads.
 
         Raises:
             JobError: the pads would move farther apart than the cell allows.

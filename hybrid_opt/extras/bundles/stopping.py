@@ -119,8 +119,8 @@ class PartnerStop:
     stop too.
 
     Attributes:
-        time: time at the planned speed in which the other arm moves as far as it does until it
-            stands [s].
+        time: duration of a motion at the planned speed that is as long as the other arm's way until
+            it stands [s].
         distance: largest displacement of the pads from their relative place that this causes [m].
         survived: displacement up to which friction holds the box, at most `distance` [m]; None if
             the stiffness is unknown.

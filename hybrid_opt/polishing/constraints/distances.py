@@ -113,7 +113,7 @@ class DistanceConstraintKind(ConstraintKind[PathRow]):
 
 
 def pair_of(row: PathRow) -> int:
-    """Return the index of the pair of bodies whose distance a row limits."""
+    """Return the index of the pair of bodies whose distance a row (scalar inequality) limits."""
     assert isinstance(row.constraint, Clearance | SeparatingAxisGap | AxisSwitchGap)
     return row.constraint.pair
 
@@ -126,7 +126,8 @@ class Clearances(DistanceConstraintKind):
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows at the local minima of distances with lower bounds below `BODY_DISTANCE`.
+        """Return rows (scalar inequalities) at the local minima of a pair's distance along the
+        path, if its lower bound is below `BODY_DISTANCE`.
 
         Args:
             carry: the candidate, evaluated at places of the path.
@@ -138,7 +139,7 @@ class Clearances(DistanceConstraintKind):
                     yield PathRow(Clearance(pair, self._columns[pair]), place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return rows for pairs of bodies that are too close.
+        """Return rows (scalar inequalities) for pairs of bodies that are too close.
 
         They lie at the place of the least distance, at the next place, and at some distance before
         and after.
@@ -165,8 +166,8 @@ class SeparatingAxisGaps(DistanceConstraintKind):
     """
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows at regular distances along every stretch of the path on which the payload is
-        near a box.
+        """Return rows (scalar inequalities) at regular distances along every part of the path on
+        which the payload is near an obstacle box.
 
         No row lies closer than `BESIDE_KINK` to a kink, a place at which the direction of the
         largest gap changes.
@@ -193,8 +194,8 @@ class SeparatingAxisGaps(DistanceConstraintKind):
                 yield separation(pair, gaps, place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return rows where the payload is too close to a box after a step, and at some distance
-        before and after.
+        """Return rows (scalar inequalities) where the payload is too close to an obstacle box after
+        a step, and at some distance before and after.
 
         Each row has the direction of the largest gap before the step. Places near a kink, where
         this direction changes, are left to `AxisSwitchGaps`.
@@ -221,8 +222,8 @@ class AxisSwitchGaps(DistanceConstraintKind):
         self.window = cell.grid.places(KINK_WINDOW)
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return a row for each kink (the payload passes an edge of a box) whose gap is below
-        `KINK_DISTANCE`.
+        """Return a row (scalar inequality) for each kink, a place at which the payload passes an
+        edge of a box, whose gap is below `KINK_DISTANCE`.
 
         Args:
             carry: the candidate, evaluated at places of the path.
@@ -233,8 +234,8 @@ class AxisSwitchGaps(DistanceConstraintKind):
                 yield passing(pair, gaps, kink, place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return a row for each kink (the payload passes an edge of a box) near a place where the
-        payload is too close after a step.
+        """Return a row (scalar inequality) for each kink, at which the payload passes an edge of a
+        box, near a place where the payload is too close after a step.
 
         The kinks are those of the candidate before the step.
 

@@ -153,8 +153,8 @@ class Forces(ConstraintKind[ForceRow]):
         self._main = PROGRAM_BRANCH if by_program else CONE_TIGHT
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[ForceRow]:
-        """Return force rows at regular distances along the path, and at and beside the local maxima
-        of the normal forces.
+        """Return rows (scalar inequalities) of normal forces at regular distances along the path,
+        and at and beside the local maxima of the normal forces.
 
         A robot whose force is not minimised, but only decides between equal candidates, has rows at
         fewer samples.
@@ -170,8 +170,8 @@ class Forces(ConstraintKind[ForceRow]):
         yield from self._other_branches(carry)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[ForceRow]:
-        """Return rows for branches (linear functions whose maximum is the normal force) other than
-        the one with rows along the whole path.
+        """Return rows (scalar inequalities) for branches (linear functions whose maximum is the
+        normal force) other than the one with rows along the whole path.
 
         They lie at samples where such a branch is the largest, or nearly so.
 
@@ -182,7 +182,8 @@ class Forces(ConstraintKind[ForceRow]):
         return self._other_branches(carry)
 
     def peak_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> set[ForceRow]:
-        """Return rows at and beside the local maxima of a candidate's minimised normal forces.
+        """Return rows (scalar inequalities) at and beside the local maxima of a candidate's
+        minimised normal forces.
 
         A program without these rows underestimates the peak forces.
 
@@ -216,8 +217,9 @@ class Forces(ConstraintKind[ForceRow]):
         return {int(k) for k in (tops[:, None] + np.array([-1, 0, 1])).ravel()}
 
     def _other_branches(self, carry: PlacedCarry) -> list[ForceRow]:
-        """Return force rows for branches (linear functions whose maximum is the normal force) other
-        than the one with tight friction cones, at samples where they are the largest or nearly so.
+        """Return rows (scalar inequalities) for branches (linear functions whose maximum is the
+        normal force) other than the one with tight friction cones, at samples where they are the
+        largest or nearly so.
 
         The list is empty for robust forces, and for forces that a convex program computes. Such
         forces have one row per robot and sample.
@@ -243,8 +245,8 @@ class Pressure(ConstraintKind[PressureRow]):
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PressureRow]:
-        """Return rows at and beside each local maximum of a robot's pressure shift above the share
-        `PRESSURE_SHARE` of the patch radius.
+        """Return rows (scalar inequalities) at and beside each local maximum of a robot's pressure
+        shift above the share `PRESSURE_SHARE` of the patch radius.
 
         Args:
             carry: the candidate, evaluated at places of the path.
@@ -253,8 +255,8 @@ class Pressure(ConstraintKind[PressureRow]):
         return self._beyond(carry, PRESSURE_SHARE)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PressureRow]:
-        """Return rows at and beside each local maximum of a pressure shift that reaches the rim of
-        the patch.
+        """Return rows (scalar inequalities) at and beside each local maximum of a pressure shift
+        that reaches the rim of the patch.
 
         Half of `PATCH_MARGIN` is left for rounding of the solver.
 
@@ -281,7 +283,8 @@ class JointLimits(ConstraintKind[PathRow]):
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows where a joint is closer to a limit than `JOINT_DISTANCE`.
+        """Return rows (scalar inequalities) where a joint is closer to a limit than
+        `JOINT_DISTANCE`.
 
         Args:
             carry: the candidate, evaluated at places of the path.
@@ -290,8 +293,8 @@ class JointLimits(ConstraintKind[PathRow]):
         return self._below(carry, JOINT_DISTANCE)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return rows where a joint is beyond a limit, or closer to it than half of
-        `SAMPLING_MARGIN`.
+        """Return rows (scalar inequalities) where a joint is beyond a limit, or closer to it than
+        half of `SAMPLING_MARGIN`.
 
         Args:
             carry: candidate after the step.
@@ -302,7 +305,8 @@ class JointLimits(ConstraintKind[PathRow]):
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[PathRow], is_relaxed: bool = False
     ) -> list[float]:
-        """Return the required distance to the joint limit for every row: `SAMPLING_MARGIN` [rad].
+        """Return the required distance to the joint limit for every row (scalar inequality):
+        `SAMPLING_MARGIN` [rad].
 
         This distance covers the path between places.
 
@@ -337,8 +341,8 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows at regular distances along the stretches of the path with a low ``|det J|``
-        of an arm's Jacobian J.
+        """Return rows (scalar inequalities) at regular distances along the parts of the path with a
+        low ``|det J|`` of an arm's Jacobian J.
 
         Low is below `MANIPULABILITY_SHARE` of the median along the path. Where ``|det J|`` is near
         its least allowed value, rows are closer together, so that the minimum does not move between
@@ -358,8 +362,8 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
                 yield PathRow(ManipulabilityLimit(arm), place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return rows where ``|det J|`` of an arm's Jacobian J is below its least allowed value
-        plus half of the margin.
+        """Return rows (scalar inequalities) where ``|det J|`` of an arm's Jacobian J is below its
+        least allowed value plus half of the margin.
 
         For an arm that does not reach all places, rows at the first unreachable place and at two
         later ones are added: there the arm is stretched out and so singular.
@@ -380,7 +384,7 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[PathRow], is_relaxed: bool = False
     ) -> list[float]:
-        """Return the required value of every row: `SAMPLING_MARGIN`.
+        """Return the required value of every row (scalar inequality): `SAMPLING_MARGIN`.
 
         A row's value is the square of ``|det J|`` over its least allowed value, minus one. The
         margin covers the path between places.
