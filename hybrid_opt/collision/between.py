@@ -216,7 +216,7 @@ class _Sweep:
         return self.required[owners]
 
     def _given_up(self, work: Intervals, level: int) -> NDArray[np.bool_]:
-        """Return True for each of m intervals that stays undecided.
+        """Return a mask (m,), True for each interval that stays undecided.
 
         At the last level these are all intervals. From `HOPELESS_DEPTH` on they are those with a
         pair that is closer than required at an end, so that no proof can succeed.
@@ -243,7 +243,7 @@ class _Sweep:
         Args:
             work: the intervals.
             end: one end of the intervals.
-            last: True to measure all pending pairs.
+            last: True to measure all pairs without a proof.
 
         Returns:
             (m,) index of the first colliding pair at each end, or -1.

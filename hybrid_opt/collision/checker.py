@@ -135,8 +135,8 @@ class CollisionChecker:
         Args:
             pose: (n, 6) box poses [m, rad].
             q_1, q_2: (n, joints) joint positions [rad].
-            clearance: (n, n_pairs) lower bounds of the active pairs' distances [m]; None to compute
-                them.
+            clearance: (n, n_pairs) lower bounds of the distances of checked pairs [m]; None to
+                compute them.
         """
         if clearance is None:
             clearance = self.bounds(pose, q_1, q_2)
@@ -170,7 +170,7 @@ class CollisionChecker:
             pose: (n, 6) box poses [m, rad].
             q_1, q_2: (n, joints) joint positions [rad].
             rows: (m,) index of the sample of each query, increasing.
-            pairs: (m,) index of the active pair of each query.
+            pairs: (m,) index of the checked pair of each query.
 
         Returns:
             (m,) True for pairs that collide.
@@ -186,7 +186,7 @@ class CollisionChecker:
 
         Args:
             pose: (6,) box pose [m, rad].
-            pair: index of the active pair of payload and body.
+            pair: index of the checked pair of payload and body.
         """
         placed = self._place(pose[None], *self._still())
         zero = np.zeros(1, dtype=np.intp)
@@ -308,7 +308,7 @@ class CollisionChecker:
         """Return the indices (m,) of the first and of the second body of each pair of bodies.
 
         Args:
-            pairs: (m,) indices of active pairs.
+            pairs: (m,) indices of checked pairs.
             resting: (m,) True where the shrunk payload replaces the payload.
         """
         first, second = self._pairs[pairs].T
@@ -331,7 +331,7 @@ class CollisionChecker:
         Args:
             placed: outputs of the function `piece_poses`.
             rows: (m,) index of the sample of each query.
-            pairs: (m,) index of the active pair of each query.
+            pairs: (m,) index of the checked pair of each query.
             resting: (m,) True where the payload may rest on the body.
         """
         first, second = self._bodies(pairs, resting)
@@ -359,7 +359,7 @@ class CollisionChecker:
         Args:
             pose: (n, 6) box poses [m, rad].
             rows: (m,) index of the sample of each query.
-            pairs: (m,) index of the active pair of each query.
+            pairs: (m,) index of the checked pair of each query.
 
         Returns:
             (m,) True for these queries.

@@ -118,7 +118,9 @@ class BodyDistances:
         """Try to prove for m pairs of bodies that they are apart, or that they intersect.
 
         Args:
-            placed, rows, first, second: as in `bounds`.
+            placed: outputs of the function `piece_poses` for n samples.
+            rows: (m,) index of the sample of each query.
+            first, second: (m,) indices of the two bodies of each query in `bodies`.
             apart: (m,) `APART` proves a distance above this value [m].
             overlap: (m,) `INTERSECTING` proves a depth of intersection above this value [m]. If the
                 value is negative, it proves a distance below minus the value.

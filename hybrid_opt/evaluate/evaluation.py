@@ -243,7 +243,8 @@ class CandidateEvaluator:
         return other
 
     def outputs(self, x: Array) -> dict[str, Array]:
-        """Compute every per-sample output of `symbolic.functions.candidate_function`.
+        """Compute all outputs of `symbolic.functions.candidate_function`, such as poses, joints and
+        forces, at the samples of candidates.
 
         In drivable cells the result also has the outputs of
         `hybrid_opt.timing.path_timer.CandidateDriver.outputs`.

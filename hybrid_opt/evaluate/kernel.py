@@ -297,7 +297,7 @@ def load_kernel(
     outputs: Callable[[Array], Mapping[str, Array]],
     lanes: int = 0,
 ) -> Kernel | None:
-    """Load or build the kernel of a cell.
+    """Load or build the kernel of a cell, a compiled evaluation of several candidates side by side.
 
     The kernel is used only if it gives the same bits as the functions that it is made of.
 

@@ -229,7 +229,7 @@ class JobCollisions:
 def job_geometry(workcell: Workcell, everywhere: bool = False) -> CellGeometry:
     """Return the bodies of a cell and the pairs of bodies that a job has to check for collisions.
 
-    The contact rules of the module decide which pairs of an arm's body and the box are checked.
+    Bodies of an arm that lie behind the plane of its pad are not checked against the box.
 
     Args:
         workcell: the cell.

@@ -50,7 +50,7 @@ class PlacedCarry:
         force: (n, 2) normal forces that are minimised, planned or robust [N].
         peak: (2,) largest of these forces of each robot over its reference force.
         shift: (n, 2) shifts of the centres of pressure over the patch radii.
-        distances: distances of all active pairs at the places within reach.
+        distances: distances of all checked pairs of bodies at the places within reach.
         gaps: function from the index of a pair of the payload and a single obstacle box to its gaps
             along several directions (reached, SEPARATING_DIRECTIONS) [m].
     """
@@ -76,13 +76,14 @@ class PlacedCarry:
 
 
 def local_minima_below(values: Array, limit: float, stride: int | None = None) -> list[int]:
-    """Return the index of the lowest value in every stretch of values below a limit.
+    """Return the index of the lowest value in every stretch, a run of successive values below a
+    limit.
 
     Args:
         values: (n,) values along the path.
-        limit: stretches are runs of successive values below this.
-        stride: number of indices; adds all indices of a stretch that are multiples of it away from
-            the lowest value. None adds none.
+        limit: the limit.
+        stride: distance between further indices of each stretch, counted from its lowest value,
+            that are returned too; None for no further ones.
     """
     below = values < limit
     if not below.any():
@@ -163,8 +164,8 @@ class Distances:
             limits: (n_pairs,) limit of each pair [m].
 
         Returns:
-            By index of each pair with such distances, an array (n,) of its distances at all places
-            [m]: measured where the lower bound is below the limit, elsewhere the lower bound.
+            Distances (n,) of each such pair at all places [m], by index of the pair. Where the
+            lower bound reaches the limit, it stands in place of the distance.
         """
         close = self.interpolated_clearance < limits
         self._measure_pairs(*(close & self._unmeasured).nonzero())
@@ -185,8 +186,8 @@ class Distances:
     def least(self, stretches: Sequence[Stretch], below: float) -> list[float]:
         """Return the least distance in each stretch of places [m].
 
-        The lowest value of a stretch is measured repeatedly until the lowest one is a measured one;
-        that is the least distance, because no distance is below its bound.
+        In a stretch the distance with the lowest bound is measured first, then the next one, until
+        a measured distance is below all remaining bounds.
 
         Args:
             stretches: for each stretch, the slice of its successive places and the index of the

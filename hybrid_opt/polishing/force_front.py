@@ -255,7 +255,7 @@ def gap_attempt(
     Args:
         archive: the front so far.
         tried: sides of gaps from which attempts started.
-        solved: number of points with which the front is complete.
+        solved: number of points from which on the front is complete.
         stride: largest distance along the front from start to aim [front's extent].
         far: width of a gap above which the large radius is tried [front's extent].
 

@@ -76,8 +76,7 @@ class ForceCurve:
 
 
 def check_search_timing(model: TimingModel, x: Array) -> Timing:
-    """Check the timing under which the search evaluated a decision vector against all limits of the
-    workcell.
+    """Check the search's timing of a decision vector against all limits of the workcell.
 
     Args:
         model: timing model of the workcell.
@@ -129,8 +128,8 @@ def _jump(model: TimingModel, carry: Carry) -> Place | None:
 def drivable_timing(model: TimingModel, x: Array) -> Timing:
     """Compute the fastest timing of a drivable carry within its own force limit.
 
-    The search's timing is kept if it satisfies the limits between its grid points too. Otherwise
-    the path is timed again by `time_path`.
+    The result is the search's timing if this satisfies the limits between its grid points as well.
+    Otherwise `time_path` computes a new timing.
 
     Args:
         model: timing model of the workcell.

@@ -253,8 +253,8 @@ class _JerkProblem:
             rows.add_norm_bounds(box, np.zeros((len(v), 3)), head, level, at.first_basis)
 
     def _excess(self, c: Array) -> Array:
-        """Compute the largest utilisation (n,) of any limit at the finer points beside each of n
-        coarse points, for spline coefficients c (k,) of the squared speed.
+        """Compute the largest use (n,) of any limit at the finer points beside each of n coarse
+        points, for spline coefficients c (k,) of the squared speed.
         """
         carry = self._model.carry(self._fine.motion, *self._fine.profile(c))
         ratios = self._model.carry_limits.ratios(carry, self._limits)
@@ -265,9 +265,7 @@ class _JerkProblem:
         return np.asarray(np.maximum(np.append(use[0], between), np.append(between, use[-1])))
 
     def _start_factor(self, c: Array) -> float:
-        """Return a factor on coefficients c (k,) that makes the motion so slow that it uses little
-        of every limit.
-        """
+        """Return a factor on spline coefficients c (k,) that makes the motion very slow."""
         factor = 1.0
         rest = max(self._check(self._coarse, 0.0 * c)[1:])
         allowed = rest + START_UTILISATION * (1.0 - rest)
@@ -293,8 +291,8 @@ class _JerkProblem:
         return timing, most_used(timing.use).ratio, joint, box
 
     def _use_by_factor(self, c: Array) -> Callable[[float], float]:
-        """Return the function from a factor on all speeds to the largest utilisation of any limit
-        on the finer grid, for spline coefficients c (k,) of the squared speed.
+        """Return the function from a factor on all speeds to the largest use of any limit on the
+        finer grid, for spline coefficients c (k,) of the squared speed.
         """
         jerk = max(float(jerk.max()) for jerk in self._jerks(self._fine, c))
 
@@ -474,7 +472,7 @@ class JerkProgram:
 
         Args:
             A: (n, m, width) entries from column `first` on.
-            head: (n, 1, width) entries of `head`, or 0.
+            head: (n, 1, width) entries of the vector `head` from column `first` on, or 0.
             bound: (n,) bounds.
             first: (n,) first column of each point's rows.
         """
@@ -491,7 +489,7 @@ class JerkProgram:
         Args:
             A: (n, 3, width) entries from column `first` on.
             b: (n, 3) constant parts.
-            head: (n, width) entries of `head`.
+            head: (n, width) entries of the vector `head` from column `first` on.
             bound: (n,) bounds.
             first: (n,) first column of each cone.
         """

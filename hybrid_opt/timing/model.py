@@ -361,7 +361,8 @@ class TimingModel:
         return {"limits": rows[None]} | poses
 
     def load(self, pose: Array, rate: Array, second_rate: Array) -> dict[str, Array]:
-        """Compute the outputs `symbolic.contact.load.LOAD_OUTPUTS` for a motion of the box.
+        """Compute the outputs `symbolic.contact.load.LOAD_OUTPUTS` (forces and wrenches by name)
+        for a motion of the box.
 
         Args:
             pose, rate, second_rate: (n, 6) box poses [m, rad], and their first and second
@@ -393,8 +394,8 @@ class TimingModel:
         )
 
     def arm_motion(self, arm: int, q: Array, pose: Array, first: Array) -> dict[str, Array]:
-        """Compute the outputs `symbolic.path_motion.ARM_OUTPUTS` of one arm while the box moves
-        straight.
+        """Compute the outputs `symbolic.path_motion.ARM_OUTPUTS` of one arm (path derivatives of
+        the joints and parts of the torques, by name) while the box moves straight.
 
         Args:
             arm: 0 or 1.

@@ -134,7 +134,7 @@ class RowSelector:
         Args:
             carry: the candidate about which the program is formed.
             rows: rows of the program.
-            is_relaxed: True to require no more of a distance than the candidate satisfies.
+            is_relaxed: True to require no larger distance between bodies than the candidate has.
         """
         values: dict[Row, float] = {}
         for kind, own in self._by_kind(rows).items():

@@ -92,8 +92,8 @@ class DistanceConstraintKind(ConstraintKind[PathRow]):
         Args:
             carry: the candidate, evaluated at places of the path.
             rows: the rows.
-            is_relaxed: True to require no more than the candidate's distance where that is
-                positive.
+            is_relaxed: True to require no larger distance than the candidate has, if its distance
+                is positive.
         """
         values = np.full(len(rows), PATCH_MARGIN)
         chosen = [k for k, row in enumerate(rows) if row.place < carry.reached]
@@ -278,8 +278,8 @@ def edges(gaps: Gaps, limit: float) -> list[tuple[int, int]]:
         limit: largest gap [m] above which kinks are left out.
 
     Returns:
-        For each kink the index of the place before it, and the index of that one of its two
-        neighbouring places at which the largest gap is smaller.
+        For each kink the index of the place before it, and the index of the neighbouring place with
+        the smaller value of the largest gap.
     """
     best, height, along = gaps.best, gaps.height, gaps.along
     return [

@@ -112,7 +112,7 @@ class ConstraintKind(ABC, Generic[AnyRow]):
         Args:
             carry: the candidate, evaluated at places of the path.
             rows: the rows.
-            is_relaxed: True to require no more of a distance than the candidate satisfies.
+            is_relaxed: True to require no larger distance between bodies than the candidate has.
         """
         return [PATCH_MARGIN] * len(rows)
 

@@ -39,8 +39,8 @@ NNLS_ITERATIONS = 30
 
 @cache
 def native() -> Any:
-    """Return the module of `rows.cpp`, `solvers/dense.cpp` and `solvers/quadratic.cpp`, which is
-    the same for every cell and compiled at installation.
+    """Return the compiled module of `rows.cpp`, `solvers/dense.cpp` and `solvers/quadratic.cpp`. It
+    is the same for every cell and was compiled at installation.
 
     Raises:
         BridgeError: it is missing or cannot be loaded.
@@ -49,12 +49,12 @@ def native() -> Any:
 
 
 class NonlinearProgram(Protocol):
-    """A nonlinear program: minimise cost . z within bounds, with the value of every row
-    nonnegative.
+    """A nonlinear program: minimise cost . z within bounds, with the value of every row (scalar
+    inequality) nonnegative.
 
     Attributes:
         cost: (n_variables,) gradient of the linear objective.
-        start, low, high: (n_variables,) start and bounds of z.
+        start, low, high: (n_variables,) start and bounds of the variables z.
     """
 
     cost: Array
@@ -63,15 +63,26 @@ class NonlinearProgram(Protocol):
     high: Array
 
     def values(self, z: Array) -> Array:
-        """Return the values (n_rows,) of all rows at z (n_variables,)."""
+        """Return the values (n_rows,) of all rows.
+
+        Args:
+            z: (n_variables,) variables.
+        """
 
     def rows(self, z: Array) -> tuple[Array, Array]:
-        """Return values (n_rows,) and slopes (n_rows, n_variables) of all rows at z
-        (n_variables,)."""
+        """Return values (n_rows,) and derivatives (n_rows, n_variables) of all rows.
+
+        Args:
+            z: (n_variables,) variables.
+        """
 
     def curvature(self, z: Array, weights: Array) -> Array:
-        """Return the Hessian (n_variables, n_variables) of weights . rows at z, for weights
-        (n_rows,)."""
+        """Return the Hessian (n_variables, n_variables) of the weighted sum of all rows.
+
+        Args:
+            z: (n_variables,) variables.
+            weights: (n_rows,) weights of the rows.
+        """
 
 
 @dataclass(frozen=True)
@@ -89,7 +100,11 @@ class Residuals:
     complementarity: Figure
 
     def scaled(self, unit: float) -> Residuals:
-        """Return the residuals for an objective that is multiplied by `unit`."""
+        """Return the residuals for an objective that is multiplied by a factor.
+
+        Args:
+            unit: the factor.
+        """
         return Residuals(unit * self.stationarity, self.feasibility, unit * self.complementarity)
 
 

@@ -44,8 +44,9 @@ Shapes = Mapping[str, ca.Sparsity]
 
 
 class _Callback(ca.Callback):  # type: ignore[misc]  # CasADi has no types
-    """A Python function of vectors (n,) in the form that CasADi calls. The `get_` methods answer
-    CasADi's queries."""
+    """A Python function of vectors (n,) as a function of CasADi. CasADi calls the `get_` methods to
+    learn its inputs and outputs.
+    """
 
     def __init__(
         self, name: str, inputs: Shapes, outputs: Shapes, evaluate: Callable[..., list[Any]]
@@ -64,23 +65,27 @@ class _Callback(ca.Callback):  # type: ignore[misc]  # CasADi has no types
         return len(self._outputs)
 
     def get_name_in(self, index: int) -> str:
-        """Return the name of an input."""
+        """Return the name of the input with an index."""
         return self._inputs[index][0]
 
     def get_name_out(self, index: int) -> str:
-        """Return the name of an output."""
+        """Return the name of the output with an index."""
         return self._outputs[index][0]
 
     def get_sparsity_in(self, index: int) -> ca.Sparsity:
-        """Return the sparsity of an input."""
+        """Return the sparsity of the input with an index."""
         return self._inputs[index][1]
 
     def get_sparsity_out(self, index: int) -> ca.Sparsity:
-        """Return the sparsity of an output."""
+        """Return the sparsity of the output with an index."""
         return self._outputs[index][1]
 
     def eval(self, arguments: Sequence[ca.DM]) -> list[Any]:
-        """Evaluate the outputs."""
+        """Return the values of all outputs.
+
+        Args:
+            arguments: values of all inputs.
+        """
         return self._evaluate(*[argument.full().ravel() for argument in arguments])
 
 
