@@ -99,8 +99,8 @@ _PACKAGES = ("casadi", "moocore", "numpy", "pin", "pymoo", "python-fcl", "scipy"
 
 @cache
 def environment() -> Mapping[str, str]:
-    """Return the versions of the software that affects a search, and a digest of this project's
-    sources, by name.
+    """Return, by name, the versions of the software that affects a search and a digest of this
+    project's sources.
     """
     versions = {name: version(name) for name in _PACKAGES}
     versions["dual-arm-carry"] = own_version()  # beside the digest of the sources

@@ -286,10 +286,12 @@ AnyRows = TypeVar("AnyRows", bound=Rows)
 
 
 def of_rows(made_of: Callable[[list[Any]], Any], records: Sequence[AnyRows]) -> AnyRows:
-    """Combine several records of one type into one record, field by field.
+    """Combine several records of one type into one record, whose fields combine the arrays of the
+    records' fields.
 
     Args:
-        made_of: function from the list of a field's arrays to the combined array.
+        made_of: function that combines a list of arrays, the same field of all records, to one
+            array.
         records: the records.
     """
     parts = zip(*(vars(record).values() for record in records), strict=True)

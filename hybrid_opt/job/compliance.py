@@ -238,8 +238,8 @@ def _displacement(job: Job, phase: Phase, late: int, delay: float) -> tuple[Arra
         delay: time by which the arm is late [s].
 
     Returns:
-        Mask of the samples of the phase without repeated times; displacement (n, 3) [m] and contact
-        normal (n, 3) at these n samples, both in the world frame.
+        Mask of the phase's samples, False where a time is repeated; displacement (n, 3) [m] and
+        contact normal (n, 3) at the n samples with True, world frame.
     """
     motion, contact = phase.motion, job.workcell.contacts[late]
     keep = np.concatenate([[True], np.diff(motion.time) > 0.0])

@@ -396,8 +396,8 @@ class ConstraintRows:
 
     @property
     def forces(self) -> Array:
-        """The two quantities (n_forces, 2) [N] from which normal forces follow, at the sample of
-        each force row and the last evaluated x.
+        """The two quantities (n_forces, 2) [N] from which normal forces follow, for each force row
+        and at the last evaluated x.
         """
         return self._forces.found[self._column]
 

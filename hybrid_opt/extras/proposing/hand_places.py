@@ -71,6 +71,7 @@ def place_entry(contact: Contact, with_normals: bool = False) -> Entry:
     `spin`, `further`, and `normal` if wanted.
 
     Args:
+        contact: the contact.
         with_normals: True to include `normal`.
     """
     entries: list[Entry] = []

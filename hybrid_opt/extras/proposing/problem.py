@@ -207,9 +207,10 @@ class Problem:
         """Return copies of the problem whose pads or hands are placed on different sides of the
         box.
 
-        Pads take each pair of opposite upright faces; on a machine each pair twice, with exchanged
-        arms. Hands take the best of `hand_places`. If the file states the points, or if a level
-        carry past two robots determines the faces, only the problem itself is returned.
+        There is one copy for each pair of opposite upright faces, for a machine with two arms also
+        one with exchanged arms. Hands are placed at the best of `hand_places`. If the file states
+        the places, or if a level carry past two robots determines the faces, only the problem
+        itself is returned.
         """
         entries = self.data["contacts"]
         start, goal = self.poses

@@ -131,7 +131,7 @@ def _free(judge: PoseJudge, *places: ChainConfiguration) -> bool:
 
     Args:
         judge: checker of collisions.
-        *places: the configurations.
+        places: the configurations.
     """
     return not any(
         judge.colliding(place.extended[None, :POSE_SIZE], place.q[0][None], place.q[1][None])[0]

@@ -85,7 +85,8 @@ def along(corners: Sequence[ChainConfiguration]) -> Array:
 def remove_corners(
     chain: ClosedChain, corners: Sequence[ChainConfiguration], rng: np.random.Generator
 ) -> list[ChainConfiguration]:
-    """Shorten a path by straight motions between random places on it.
+    """Shorten a path: replace parts of it by straight collision-free motions between random places
+    on it.
 
     Args:
         chain: both arms, whose pads stay fixed on the box.
