@@ -116,7 +116,8 @@ class Workers(ABC):
 class LocalWorkers(Workers):
     """Worker processes on this machine.
 
-    A single call, or every call with one job, runs in this process and can crash it.
+    A single call runs in this process itself, and so do all calls if only one process is allowed. A
+    crash then ends this process.
     """
 
     def __init__(self, jobs: int = 1) -> None:

@@ -322,8 +322,8 @@ class Intervals(Rows):
     """m intervals that are not yet proven free.
 
     Attributes:
-        index: (m,) index of the interval between samples that contains the interval.
-        start, width: (m,) start and width as shares of this interval between samples, 0 to 1.
+        index: (m,) index of the pair of successive samples between which the interval lies.
+        start, width: (m,) start and width as shares of the way between these two samples, 0 to 1.
         a, b: the two ends.
         chord, bend: (m, n_pairs) bounds of the relative motion of each pair [m].
         pending: (m, n_pairs) True for pairs without a proof.

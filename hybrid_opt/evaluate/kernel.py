@@ -181,8 +181,8 @@ class Kernel:
                 runs in the calling thread.
             begin: (joints of both arms,) joint positions that hold the box at the start [rad]; None
                 for the cell's start branches.
-            all_forces: in cells whose contact forces are the solution of an optimisation, False
-                leaves the forces of a candidate at zero if it violates another constraint.
+            all_forces: matters if an optimisation computes the contact forces. False leaves the
+                forces of candidates that violate another constraint at zero.
 
         Raises:
             CodegenError: memory is short.

@@ -186,9 +186,9 @@ def transmitted_share(difference: Array, uncertainty: Uncertainty) -> Array:
     """Compute the share of the difference of both normal forces that acts on the leading
     (position-controlled) arm, for the payload mass that loads this arm most.
 
-    A positive difference is largest for the largest mass, and acts in full: the share is 1. A
-    negative difference is smallest in size for the least mass: the share is (1 - s) / (1 + s) with
-    s the relative uncertainty of the mass.
+    If the difference is positive, the largest mass loads the arm most, and the share is 1. If it is
+    negative, the least mass does, and the share is (1 - s) / (1 + s) with the relative uncertainty
+    s of the mass.
 
     Args:
         difference: leading minus commanded normal force for the largest mass [N], of any shape.

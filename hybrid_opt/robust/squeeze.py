@@ -315,8 +315,8 @@ def smooth_above(time: Array, values: Array, width: float) -> Array:
     """Compute a smooth curve that is nowhere below a given curve, and level at both ends.
 
     At each time the maximum of the curve within a window is taken, and these maxima are averaged
-    over the same window with a smooth kernel. Each maximum that enters the average at a time is at
-    least the value of the curve at that time, so the average is as well.
+    over the same window with a smooth kernel. So the result at each time is an average of values
+    that are at least the value of the curve there.
 
     Args:
         time: (n,) times, not decreasing [s].

@@ -149,8 +149,7 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
         return "" if use[name] <= 1.0 else name
 
     def lowered(whose: str, which: Array) -> Margin:
-        """Return the margin of the friction at some contacts, whose coefficients are lowered by one
-        common share.
+        """Return how far the friction coefficients of some contacts may fall, by one common share.
 
         Args:
             whose: name of these contacts, for the margin.
@@ -164,8 +163,8 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
         return Margin(f"friction of {whose}", "", nominal, nominal * (1.0 - lost), fails)
 
     def shifted(axis: int, sign: float) -> Margin:
-        """Return the margin of the centre of mass along one axis of the box, at most to the box's
-        face.
+        """Return how far the centre of mass may shift along one axis of the box, at most to the
+        box's face.
 
         Args:
             axis: index of the axis: 0, 1 or 2.

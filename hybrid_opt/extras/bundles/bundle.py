@@ -394,10 +394,10 @@ def export(
 
 
 def prepared(job: Job, name: str, options: BundleOptions) -> Export:
-    """Sample a job at a time step.
+    """Sample a job for a bundle, at even time steps.
 
-    The step is the requested one, or else the longest one with a small enough error of the pads'
-    forces between samples: at most the share `TRACKED`.
+    The step is the requested one. Without a request it is the longest one for which the pads'
+    forces between samples differ from the commanded ones by at most the share `TRACKED`.
 
     Args:
         job: the job.

@@ -351,7 +351,7 @@ def missing_loads(workcell: Workcell) -> list[str]:
 
 
 def missing_text(name: str, workcell: Workcell) -> str:
-    """Return the sentences of `missing_for` as one text for a terminal.
+    """Return a text for a terminal on what a cell lacks for a target.
 
     Args:
         name: name of the target.
