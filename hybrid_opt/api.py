@@ -86,7 +86,7 @@ def polish(
             done and the number expected in all; the second number may change.
 
     Raises:
-        SettingsError: the cell's objectives are not those of the polish, or a path does not fit.
+        SettingsError: the polish does not support the cell's objectives, or a path does not fit.
     """
     cell, task = front.cell, front.cell.workcell.task
     settings = settings or default_settings(task.law.is_drivable)

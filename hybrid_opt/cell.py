@@ -238,7 +238,7 @@ class Cell:
             settings: settings of the polish.
 
         Raises:
-            SettingsError: the cell's objectives or pads are not those of the polish.
+            SettingsError: the polish does not support the cell's objectives or pads.
         """
         # Not imported at the top: solvers take long to load.
         from hybrid_opt.polishing.polisher import Polisher

@@ -128,8 +128,8 @@ class Front(Displayable):
     def balanced(self) -> Carry:
         """Return the carry with the least mean of the two robots' peak normal forces.
 
-        Of several carries whose means differ by less than `TIE`, the one whose larger peak is least
-        is returned.
+        Of several carries whose means differ by less than `TIE`, the carry with the least larger
+        peak is returned.
 
         Raises:
             SettingsError: the front is empty.
@@ -224,8 +224,8 @@ class SelectedCarry:
 def balanced(peak_normal_force: Array) -> int:
     """Return the index of the carry with the least mean of both robots' peak normal forces.
 
-    Of several carries whose means differ by less than `TIE`, the one whose larger peak is least is
-    chosen.
+    Of several carries whose means differ by less than `TIE`, the carry with the least larger peak
+    is chosen.
 
     Args:
         peak_normal_force: (k, 2) peak normal force of each robot in k carries [N].

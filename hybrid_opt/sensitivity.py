@@ -227,8 +227,8 @@ def sensitivities(carry: Carry | Timing, *, progress: ShowProgress = False) -> S
     workcell file.
 
     For a carry under a time law, the motion follows the law in the changed cell. For a timing, the
-    duration is that of the fastest timing of the path within the same limits in the changed cell;
-    the force is that of the motion with unchanged path speeds.
+    duration is the duration of the fastest timing of the path within the same limits in the changed
+    cell. The force is the force of the motion with unchanged path speeds.
 
     Args:
         carry: a carry under the time law of its task, or the fastest timing of a path within

@@ -220,8 +220,8 @@ def decided_cell(
         execution: settings of the execution, with the results folder.
 
     Returns:
-        Workcell with fixed start branches, and the competition that chose them; None for the latter
-        if the workcell file states the branches.
+        Workcell with fixed start branches; and the competition that chose them, None if the
+        workcell file states the branches.
 
     Raises:
         DualArmError: no pair of branches can carry the box on any trajectory, or the stored choice

@@ -85,8 +85,9 @@ def joint_tables(geometry: CellGeometry) -> tuple[JointTable, ...]:
     """Build tables of lower bounds of distances for pairs of bodies that compiled bounds often
     cannot decide.
 
-    Both joints between the bodies of such a pair turn and belong to one arm. A body has a hull. The
-    bodies are close in many postures, or the arm is mounted on the earlier body.
+    A pair gets a table under three conditions. There are two joints between its bodies, both
+    turning joints of one arm. One of the bodies has a hull. The bodies are close in many postures,
+    or the arm is mounted on the earlier body.
     """
     close, found = close_pairs(geometry), []
     for k, pair in enumerate(geometry.active):

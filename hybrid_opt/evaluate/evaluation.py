@@ -339,7 +339,7 @@ class CandidateEvaluator:
 
         The members of the front are certified along their whole paths. A member without proof
         becomes infeasible for the reason `between_samples`. Candidates that then enter the front
-        are certified likewise, until every member has a proof.
+        are certified next, until every member has a proof.
         """
         feasible, reason = evaluations.feasible.copy(), evaluations.reason.copy()
         position, violation = evaluations.position.copy(), evaluations.violation.copy()

@@ -203,7 +203,7 @@ class CarryProblem(Problem):  # type: ignore[misc]
     Attributes:
         evaluator: evaluator of the candidates.
         drawn: task with fewer waypoints whose decision vectors pymoo varies; None if pymoo varies
-            those of the evaluated task.
+            the decision vectors of the evaluated task itself.
         task: task of the evaluated candidates, to which the vectors of `drawn` are resampled; None
             if `drawn` is None.
         handling: 'penalty' or 'constraints'.
@@ -224,9 +224,9 @@ class CarryProblem(Problem):  # type: ignore[misc]
             evaluator: evaluator of the candidates.
             handling: 'penalty' or 'constraints', see the class.
             evaluated: function called after each batch with the number of candidates in the batch.
-            task: task of the evaluated candidates. If it has further waypoints between those of the
-                workcell file, pymoo varies only the latter. None varies the evaluator's own
-                variables.
+            task: task of the evaluated candidates. Pymoo varies only the waypoints that the
+                workcell file states; further waypoints of the task follow from them. None varies
+                the evaluator's own variables.
         """
         self.task = task if task is not None and task.pieces > 1 else None
         self.drawn = None if self.task is None else coarse_task(self.task)
@@ -396,8 +396,9 @@ def search_carries(
         rng: random generator of the whole run.
         settings: settings of the search.
         evaluated: function called after each batch with the number of candidates in the batch.
-        task: task of the candidates. If it has further waypoints between those of the workcell
-            file, only the latter are varied. None varies the evaluator's own variables.
+        task: task of the candidates. Only the waypoints that the workcell file states are varied;
+            further waypoints of the task follow from them. None varies the evaluator's own
+            variables.
 
     Returns:
         The evaluations of all candidates in order, and the generation (n,) of each, from 1.

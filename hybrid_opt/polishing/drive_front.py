@@ -64,8 +64,8 @@ class DriveAttempt(Attempt):
     """An attempt to reduce the duration at the force limit that its decision vector contains.
 
     Attributes:
-        moves: which waypoints the solve moves: 'stated' for those of the workcell file, 'all', or
-            'none' to evaluate x unchanged.
+        moves: waypoints that the solve moves: 'stated' for the waypoints of the workcell file,
+            'all', or 'none' to evaluate x unchanged.
     """
 
     moves: Literal["stated", "all", "none"] = "stated"
@@ -76,7 +76,7 @@ class DriveGap:
     """A gap between two neighbouring points of the front.
 
     Attributes:
-        force: force limit between those of both points [N].
+        force: force limit between the force limits of both points [N].
         ends: indices of both points in the archive.
     """
 
@@ -298,8 +298,8 @@ class DriveRun(PolishRun[DriveAttempt]):
     def _limits(self, least: float, fast: float, count: int) -> list[float]:
         """Return increasing force limits [N] for the sweep.
 
-        Their excess over the force at rest, which decides the duration, grows geometrically. After
-        `fast` limits continue in this ratio up to the largest limit of the front.
+        Their excess over the force at rest, which decides the duration, grows geometrically. Beyond
+        `fast` further limits in this ratio follow, up to the largest limit of the front.
 
         Args:
             least: first limit [N].

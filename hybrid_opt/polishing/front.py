@@ -39,7 +39,7 @@ OPTIMAL_STATIONARITY = 1e-3
 
 
 class ParetoArchive:
-    """Points of a front during its polish: those of the given front, and new ones.
+    """Points of a front during its polish: the points of the given front, and new points.
 
     Attributes:
         x: decision vectors (n_var,), one per point.

@@ -478,7 +478,8 @@ class PathTimingProgram:
         self._geometry_slope = np.concatenate([self._geometry_slope, by_path])
 
     def _speeds(self, w: Array) -> None:
-        """Store the duration and its derivatives by omega, and those of u'' and u'^2 at each point.
+        """Store the duration, and the derivatives of the duration and of u'' and u'^2 at each point
+        by the relative speed changes omega.
 
         Args:
             w: (intervals + 1,) squared path speeds u'^2 of the iterate [1/s^2].

@@ -384,7 +384,7 @@ def best_of_paths(
     """Yield the best paths that keep the limits of a goal, each with its cheapest timing, cheapest
     first.
 
-    Force limits between those of the given timings are tried as well.
+    Force limits between the limits of the given timings are tried as well.
 
     Args:
         paths: paths to which the timings belong.

@@ -104,7 +104,7 @@ class ForwardBackwardPasses:
                 in the middle of every interval. Robust limits also need `pose`, `pose_first` and
                 `pose_second` (n, 2 intervals + 1, 6 or more) there.
             limits: limits of all paths, for which `supports` returns True.
-            force: (n,) force limit of each path [N]; None for that of `limits`.
+            force: (n,) force limit of each path [N]; None for the force limit in `limits`.
         """
         most = np.inf if limits.force is None else limits.force
         options = np.empty((len(paths["limits"]), 4))

@@ -124,7 +124,7 @@ class PathTimer:
         return timing
 
     def path_errors(self, paths: dict[str, Array]) -> list[PathTiming | None]:
-        """Return for each path the error because of which no timing exists, None without an error.
+        """Return for each path the error that rules out a timing, None without an error.
 
         Errors are: no motion, an arm that loses the path, joint limits, and manipulability.
 
@@ -155,7 +155,7 @@ class PathTimer:
         Args:
             x: (n, n_path) free waypoints.
             limits: limits of all paths, in addition to the workcell's.
-            force: (n,) force limit of each path [N]; None for that of `limits`.
+            force: (n,) force limit of each path [N]; None for the force limit in `limits`.
             paths: result of `path_limits`; computed if None.
             path_errors: result of `path_errors`; computed if None.
 

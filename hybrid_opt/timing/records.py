@@ -212,7 +212,7 @@ class Validation:
 
     @property
     def ratio(self) -> float:
-        """Return the duration of the timing over that of TOPP-RA."""
+        """Return the duration of the timing over the duration by TOPP-RA."""
         return self.duration / self.reference
 
     @property

@@ -339,7 +339,8 @@ class Export:
     def effort(self) -> Array:
         """(n, joints) joint torques of the planned motion with the commanded forces, gravity
         included, both arms side by side [N m, for sliding joints N]. A joint that moves both arms
-        balances the contact forces of both."""
+        balances the contact forces of both arms.
+        """
         return self.sampled.effort + self._of_other(self._contact(self.sampled.wrench))
 
     def _contact(self, wrench: Array) -> Array:

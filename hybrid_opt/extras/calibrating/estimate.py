@@ -162,7 +162,7 @@ def _balance(hold: MeasuredHold) -> tuple[Array, Array, Array]:
 
     Returns:
         Matrix (6, unknowns), right side (6,), and covariance (6, 6) of the right side. The unknowns
-        are those of `Load`.
+        are mass, centre of mass and crosstalk, as in `Load`.
     """
     matrix, value, noise = np.zeros((6, len(WIDTHS))), np.zeros(6), np.zeros((6, 6))
     matrix[:3, 0] = hold.gravity
@@ -225,8 +225,8 @@ def delay(
 
     Returns:
         The delay with the largest correlation of both signals' rates; None if the signals are too
-        short, if that correlation is weak, or if it is hardly better than that of a delay up to
-        `apart`.
+        short, if that correlation is weak, or if the correlation for a delay up to `apart` is
+        nearly as large.
     """
     wide = round(SMOOTHED / GRID_STEP)
     if not 4 * wide < (time[-1] - time[0]) / GRID_STEP < LARGEST_GRID:

@@ -151,7 +151,8 @@ class HandSimulation:
 
         Args:
             motion: motion of the carriage, which bears all hands.
-            holding_force: holding force of each hand, or (2,) that of each robot's hands [N].
+            holding_force: holding force [N], one number for all hands or (2,) for the hands of each
+                robot.
             factor: number by which the holding forces are multiplied.
         """
         mujoco, settings = self._mujoco, self.settings
@@ -215,8 +216,8 @@ class HandSimulation:
 
 
 def own_forces(workcell: Workcell, forces: Array) -> Array:
-    """Convert holding forces that are stated for the robot with the weaker hands to those of each
-    robot's own hands.
+    """Convert holding forces that would apply if both robots had the weaker hands to the holding
+    forces of each robot's own hands.
 
     Args:
         workcell: the cell.
@@ -350,8 +351,8 @@ def _displacement(workcell: Workcell, layer: float, opposed: ArrayLike) -> Array
 
 
 def lip_points(hand: Contact, points: int) -> Array:
-    """Compute points of a hand that press on the payload, in the plane of its patch, whose mean
-    squared coordinates equal those of the patch.
+    """Compute points in the plane of a hand's patch at which the hand presses on the payload. The
+    mean of their squared coordinates equals the mean over the patch.
 
     Args:
         hand: the hand.

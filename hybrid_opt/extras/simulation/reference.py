@@ -153,8 +153,8 @@ def carry_reference(
         carry: the carry at n samples.
         press: (n,) commanded normal force of the arm that does not lead [N]; None for its planned
             force.
-        leader: index of the arm that keeps its place. Its normal force is the planned one plus what
-            `press` adds to that of the other arm.
+        leader: index of the arm that keeps its place. Its normal force rises above the planned one
+            by as much as `press` exceeds the other arm's planned force.
 
     Raises:
         SettingsError: the carry does not start and end at rest, or `press` has another shape.
