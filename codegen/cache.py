@@ -445,7 +445,7 @@ class Cache:
         except FileNotFoundError:
             return None
         except OSError as error:
-            raise CodegenError(_cannot_use(path, error)) from error
+            raise CodegenError(_cannot_use(path, error), code="cache-unusable") from error
         except OutsideError as error:
             raise CodegenError(
                 f"the cache of compiled functions cannot be used: {path} {error}; grant access "

@@ -75,11 +75,15 @@ class ExecutionSettings:
         """
         require_allowed(self)
         if self.resume and self.overwrite:
-            raise SettingsError("--resume keeps results and --overwrite removes them: give one")
+            raise SettingsError(
+                "--resume keeps results and --overwrite removes them: give one",
+                code="resume-or-overwrite",
+            )
         if (self.executor == "dask") != bool(self.scheduler):
             raise SettingsError(
                 "the executor 'dask' needs a scheduler's address, and only it takes one: "
-                "--executor dask --scheduler tcp://HOST:8786"
+                "--executor dask --scheduler tcp://HOST:8786",
+                code="scheduler",
             )
 
 
@@ -142,7 +146,8 @@ def require_equal(stored: Any, wanted: Mapping[str, Any], where: str) -> None:
         raise ResultsError(
             f"{where}: holds results of something else, and they are never mixed; choose another "
             "--output, remove them with --overwrite, or repeat the command with what they were "
-            f"made with:\n{listed}"
+            f"made with:\n{listed}",
+            code="other-settings",
         )
 
 
@@ -261,7 +266,8 @@ def require_usable(execution: ExecutionSettings) -> None:
     if strays:
         raise ResultsError(
             f"{root}: is no results folder, but not empty ({', '.join(sorted(strays)[:3])}); "
-            "choose another --output"
+            "choose another --output",
+            code="not-empty",
         )
 
 
@@ -306,5 +312,7 @@ def _stored_cell(root: Path, files: CellFiles) -> Workcell:
             sync_folder(root)
     workcell = load(folder / files.workcell)
     if workcell.digest != files.digest:
-        raise ResultsError(f"{folder}: was changed after the campaign began; {_ELSEWHERE}")
+        raise ResultsError(
+            f"{folder}: was changed after the campaign began; {_ELSEWHERE}", code="changed-workcell"
+        )
     return workcell

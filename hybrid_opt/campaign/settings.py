@@ -63,7 +63,8 @@ def chosen(
     if len(sizes) != len(populations) or not sizes.keys() <= set(names):
         raise SettingsError(
             f"populations for {', '.join(name for name, _ in populations)}: name each algorithm of "
-            f"the campaign ({', '.join(names)}) at most once"
+            f"the campaign ({', '.join(names)}) at most once",
+            code="repeated",
         )
     return {name: sized(name, sizes[name]) if name in sizes else {} for name in names}
 
@@ -101,7 +102,7 @@ class CampaignSettings:
         require_allowed(self)
         select_objectives(self.objectives)
         if not self.algorithms:
-            raise SettingsError("algorithms: name at least one")
+            raise SettingsError("algorithms: name at least one", code="no-algorithm")
         whole = {
             name: asdict(metaheuristics.settings_of(name, own))
             for name, own in self.algorithms.items()

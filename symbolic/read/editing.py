@@ -120,7 +120,8 @@ def _edited(
             return found
     raise SettingsError(
         "the file cannot be completed as it is written; begin each section with a heading of "
-        "its own ([task], [[contacts]]) and keep what belongs to one together"
+        "its own ([task], [[contacts]]) and keep what belongs to one together",
+        code="not-completable",
     )
 
 

@@ -68,12 +68,16 @@ def parse_elements(document: str, root_tag: str = "robot") -> ElementTree.Elemen
         line, column = error.position
         said = str(error).split(":")[0]
         raise OutsideError(
-            f"is not readable XML: {said}, line {line + lines}, column {column}"
+            f"is not readable XML: {said}, line {line + lines}, column {column}", code="not-xml"
         ) from error
     except ValueError as error:
-        raise OutsideError("is not readable XML: it holds characters that are none") from error
+        raise OutsideError(
+            "is not readable XML: it holds characters that are none", code="not-xml"
+        ) from error
     if root.tag != root_tag:
-        raise OutsideError(f"its root is <{shown(root.tag)[1:-1]}>; allowed is <{root_tag}>")
+        raise OutsideError(
+            f"its root is <{shown(root.tag)[1:-1]}>; allowed is <{root_tag}>", code="wrong-root"
+        )
     if any("xacro}" in element.tag for element in root.iter()):
         raise OutsideError("holds xacro macros; expand it: `xacro FILE > robot.urdf`")
     return root

@@ -38,7 +38,9 @@ def compiled(path: Path) -> Any:
         spec = mujoco.MjSpec.from_file(str(path))
         return mujoco, spec, spec.compile()
     except ValueError as error:
-        raise OutsideError(f"MuJoCo does not take it: {printable(str(error))}") from error
+        raise OutsideError(
+            f"MuJoCo does not take it: {printable(str(error))}", code="not-mjcf"
+        ) from error
 
 
 def geom_shape(
@@ -82,7 +84,9 @@ def mjcf_as_urdf(path: Path, content: bytes) -> bytes:
     """
     mujoco, spec, model = compiled(path)
     if any(np.any(mesh.refpos) or abs(mesh.refquat[0]) < 1.0 for mesh in spec.meshes):
-        raise OutsideError("moves a mesh by refpos or refquat; move its geom instead")
+        raise OutsideError(
+            "moves a mesh by refpos or refquat; move its geom instead", code="moved-mesh"
+        )
     return _Writer(mujoco, model).urdf()
 
 
@@ -133,10 +137,13 @@ class _Writer:
             if kind not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
                 raise OutsideError(
                     f"joint {called!r} of body {name!r} is a ball; allowed are hinges, slides and "
-                    "free joints, which are held where the file has them"
+                    "free joints, which are held where the file has them",
+                    code="joint-kind",
                 )
             if model.qpos0[model.jnt_qposadr[joint]]:
-                raise OutsideError(f"joint {called!r} has a ref; allowed is zero")
+                raise OutsideError(
+                    f"joint {called!r} has a ref; allowed is zero", code="joint-reference"
+                )
             at = transform(np.eye(3), model.jnt_pos[joint])
             last = joint == first + count - 1 and not np.any(model.jnt_pos[joint])
             child = name if last else f"{called}_link"
@@ -216,7 +223,8 @@ class _Writer:
         else:
             raise OutsideError(
                 f"body {name!r} has a shape of the kind {kind}; allowed are boxes, cylinders, "
-                "spheres, capsules, planes and meshes with a file"
+                "spheres, capsules, planes and meshes with a file",
+                code="shape-kind",
             )
         _add(_add(_add(link, "collision", pose), "geometry"), kind, **said)
 

@@ -54,7 +54,8 @@ def read_scene(path: Path) -> ImportedScene:
         if kind not in READERS:
             raise OutsideError(
                 "is no scene that is read; allowed are SDF (<sdf>), MJCF (<mujoco>) and planning "
-                "scenes of MoveIt (.yaml, .scene)"
+                "scenes of MoveIt (.yaml, .scene)",
+                code="no-scene",
             )
         READERS[kind](path, found)
     except OutsideError as error:
@@ -112,11 +113,14 @@ class _Scope:
             if head not in self.frames or (rest and head not in self.inner):
                 raise OutsideError(
                     f"{self.part.path}: names the frame {shown(name)}, which is not in it"
-                    f"{suggestion(name, self.frames)}"
+                    f"{suggestion(name, self.frames)}",
+                    code="unknown-frame",
                 )
             met += 1
             if met > MOST_FRAMES:
-                raise OutsideError(f"{self.part.path}: frame {shown(name)} depends on itself")
+                raise OutsideError(
+                    f"{self.part.path}: frame {shown(name)} depends on itself", code="circular"
+                )
             if rest:
                 T_name = self.inner[head].frame(rest) @ T_name
             name, pose = self.frames[head]
@@ -201,7 +205,7 @@ class _Sdf:
             self._found.leave(wanted or part.path, f"{why} {shown(address)}, {reason}")
             return
         if path.resolve() in trail:
-            raise OutsideError(f"{part.path}: {path.name} includes itself")
+            raise OutsideError(f"{part.path}: {path.name} includes itself", code="circular")
         try:
             root = self._root(path, f"{path.name}:")
         except OutsideError as error:
@@ -320,9 +324,13 @@ def read_message(path: Path) -> dict[str, Any]:
         # `ros2 topic echo` ends a message by a line that begins the next one.
         document = next(iter(yaml.load_all(text, Loader=_Loader)), None)
     except (yaml.YAMLError, ValueError, RecursionError) as error:
-        raise OutsideError(f"is not readable YAML: {' '.join(str(error).split())[:200]}") from error
+        raise OutsideError(
+            f"is not readable YAML: {' '.join(str(error).split())[:200]}", code="not-yaml"
+        ) from error
     if not isinstance(document, dict):
-        raise OutsideError("is no message; allowed is a mapping, as `ros2 topic echo` writes it")
+        raise OutsideError(
+            "is no message; allowed is a mapping, as `ros2 topic echo` writes it", code="no-message"
+        )
     return document
 
 
@@ -337,7 +345,9 @@ def _read_moveit(path: Path, found: SceneBuilder) -> None:
     whole = TableReader(scene if isinstance(scene, dict) else document, "", found.problems)
     world = whole.table("world", {}) if "world" in whole else whole
     if "collision_objects" not in world:
-        raise OutsideError("has no world.collision_objects; is it a planning scene of MoveIt?")
+        raise OutsideError(
+            "has no world.collision_objects; is it a planning scene of MoveIt?", code="no-scene"
+        )
     frames = {
         str(each.raw("child_frame_id", "")).lstrip("/"): _frame(
             each.table("transform", {}), "translation", "rotation"
@@ -495,7 +505,8 @@ def _read_moveit_text(path: Path, found: SceneBuilder) -> None:
             _written_object(name.strip(), rest.split(), placed, found)
         except (ValueError, IndexError, OverflowError) as error:
             raise OutsideError(
-                f"object {shown(name.strip())} is not as MoveIt writes it ({error})"
+                f"object {shown(name.strip())} is not as MoveIt writes it ({error})",
+                code="not-as-written",
             ) from error
 
 

@@ -335,7 +335,7 @@ def test_a_study_whose_cluster_dies_in_every_stage_is_the_same(tmp_path: Path) -
             running_cluster.scheduler.kill()
             code = ended(process, said)
             assert code == 2, said.read_text()
-            assert "continue with --resume" in said.read_text()
+            assert "--resume" in said.read_text()
     with cluster(tmp_path, "last") as whole:
         process = start(whole)
         assert ended(process, said) == 0, said.read_text()

@@ -193,7 +193,9 @@ def read_trajectory(path: Path, workcell: Workcell) -> JointTrajectory:
                     carry = document["time"][phase["first"]], document["time"][phase["last"]]
         return replace(_chosen(columns, workcell), carry=carry)
     except (ValueError, KeyError, TypeError, IndexError, yaml.YAMLError, csv.Error) as error:
-        raise ResultsError(f"{path}: no joint trajectory of both arms ({error})") from error
+        raise ResultsError(
+            f"{path}: no joint trajectory of both arms ({error})", code="no-trajectory"
+        ) from error
 
 
 QUANTITIES = ("position", "velocity", "acceleration")

@@ -282,7 +282,9 @@ def require_target(name: str) -> None:
         SettingsError: the name is unknown, or the target is no longer written.
     """
     if name in GONE:
-        raise SettingsError(f"target {name!r} is no longer written; use {GONE[name]}")
+        raise SettingsError(
+            f"target {name!r} is no longer written; use {GONE[name]}", code="former-target"
+        )
     if name not in TARGETS:
         raise SettingsError(
             f"unknown target {name!r}; known are {', '.join(TARGETS)}", code="unknown-target"

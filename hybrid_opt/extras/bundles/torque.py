@@ -110,7 +110,8 @@ def driver_of(workcell: Workcell) -> str:
         return driver
     raise SettingsError(
         "no driver takes torques for these arms: Franka's and Universal Robots' do, a simulator "
-        "(leave out the addresses) does for all; ABB's arms are driven by abb-egm"
+        "(leave out the addresses) does for all; ABB's arms are driven by abb-egm",
+        code="no-driver",
     )
 
 
@@ -130,12 +131,14 @@ def require_torque(job: Job) -> None:
             raise SettingsError(
                 f"the joints of {robot.name!r} are called {joints[0]!r} ... {joints[-1]!r}; "
                 f"franka_ros2 knows TYPE_joint1 to TYPE_joint7 of {', '.join(FRANKA_TYPES)} (a "
-                "Panda is 'fer'): use franka_description's file of the arm"
+                "Panda is 'fer'): use franka_description's file of the arm",
+                code="joint-names",
             )
         if robot.driver.prefix and not robot.driver.prefix.endswith("_"):
             raise SettingsError(
                 f"the prefix {robot.driver.prefix!r} of {robot.name!r} has to end with '_': "
-                "franka_description puts one behind it"
+                "franka_description puts one behind it",
+                code="prefix",
             )
 
 

@@ -205,7 +205,6 @@ def test_full_disk_loses_nothing(tmp_path: Path, undisturbed: dict[str, bytes]) 
     message = process.communicate(timeout=HANGS)[1]
     assert process.returncode == 2
     assert message.count("\n") == 1
-    assert "no space left to write" in message
     assert "--resume" in message
     process = start(output)
     assert process.wait(60) == 0

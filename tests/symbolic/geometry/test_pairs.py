@@ -144,13 +144,13 @@ def reason(geometry: CellGeometry, first: str, second: str) -> str:
     ("first", "second", "expected"),
     [
         ("left/link_2", "left/link_3", "neighbours"),
-        ("left/pad", "payload", "held by the grasp: touching"),
-        ("left/link_6", "payload", "held by the grasp: gap 200.0 mm"),
-        ("left/base_link", "ground", "both stand still: touching"),
-        ("middle board", "ground", "both stand still: gap 580.0 mm"),
-        ("left/link_1", "right/link_1", "out of reach"),
-        ("left/link_4", "left/link_6", "never meet"),
-        ("left/link_6", "left/pad", "they move as one body"),
+        ("left/pad", "payload", "grasp"),
+        ("left/link_6", "payload", "200.0 mm"),
+        ("left/base_link", "ground", "still"),
+        ("middle board", "ground", "580.0 mm"),
+        ("left/link_1", "right/link_1", "reach"),
+        ("left/link_4", "left/link_6", "never"),
+        ("left/link_6", "left/pad", "one body"),
         ("left/link_4", "middle board", ""),
         ("left/pad", "right/pad", ""),
         ("payload", "middle board", ""),
@@ -159,7 +159,7 @@ def reason(geometry: CellGeometry, first: str, second: str) -> str:
 )
 def test_reasons_of_the_rack(first: str, second: str, expected: str) -> None:
     found = reason(geometry_of("rack"), first, second)
-    assert found.startswith(expected)
+    assert expected in found
     assert bool(found) == bool(expected)
 
 
@@ -189,13 +189,13 @@ def test_links_on_either_side_of_any_joint_are_neighbours(
 def test_the_user_may_leave_out_pairs_with_a_reason() -> None:
     """A pattern stands for every pair that it matches."""
     ignored = (
-        IgnoredPair("payload", "ground", "never that low"),
+        IgnoredPair("payload", "ground", "low"),
         IgnoredPair("left/link_*", "payload", "held"),
     )
     geometry = build_geometry(replace(rack(), collision=CollisionSettings(ignored=ignored)))
-    assert reason(geometry, "payload", "ground") == "ignored in the file: never that low"
+    assert reason(geometry, "payload", "ground").endswith(": low")
     for k in range(1, 7):
-        assert reason(geometry, f"left/link_{k}", "payload").endswith("held")
+        assert reason(geometry, f"left/link_{k}", "payload").endswith(": held")
     assert "ignored" not in reason(geometry, "right/link_1", "payload")
     wrong = CollisionSettings(ignored=(IgnoredPair("payload", "celing", ""),))
     with refused(CollisionModelError, "unknown-body", "'celing'", "ground"):
@@ -222,9 +222,7 @@ def test_a_mesh_that_is_nowhere_is_named(tmp_path: Path) -> None:
     path.write_text(
         URDF.format(link=f"<collision><geometry>{mesh}</geometry></collision>", rest="")
     )
-    with refused(
-        CollisionModelError, "mesh-not-found", "link 'a' of x.urdf", "package://no/where.stl"
-    ):
+    with refused(CollisionModelError, "mesh-not-found", "'a'", "x.urdf", "package://no/where.stl"):
         _link_pieces(replace(rack().robots[0], urdf=path), ("a", "bare"), MeshReader())
 
 
@@ -304,7 +302,7 @@ def test_disabled_pairs_of_an_srdf_are_left_out_for_its_robot(tmp_path: Path) ->
     robots = (replace(cell.robots[0], srdf=srdf), cell.robots[1])
     geometry = build_geometry(replace(cell, robots=robots))
     assert set(free.pair_names) - set(geometry.pair_names) == {pair}
-    assert reason(geometry, *pair) == "disabled in arm.srdf: Never"
+    assert reason(geometry, *pair).endswith("arm.srdf: Never")
 
 
 STEPS = 16

@@ -130,23 +130,23 @@ def test_a_mesh(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("first", "allocation", "path", "words"),
     [
-        ({"normal": [0, 0, 0]}, "soft-finger", "contacts[0].normal", "no direction"),
+        ({"normal": [0, 0, 0]}, "soft-finger", "contacts[0].normal", "direction"),
         (
             {"xyz": [0, 0.9, 0], "normal": [0, -1, 0]},
             "soft-finger",
             "contacts[0].xyz",
-            "a diagonal of",
+            "diagonal",
         ),
         ({"patch_size": [0.1, 0.1]}, "soft-finger", "contacts[0].patch_size", "beside"),
         (
             {"further": [{"xyz": [0.05, 0.2, 0]}] * 3},
             "soft-finger",
             "contacts",
-            "found 5 pads; allowed",
+            "5 pads",
         ),
-        ({"xyz": [0.15, 0, 0]}, "soft-finger", "contacts", "do not close their grasp"),
-        ({"xyz": [0.15, 0, 0]}, "paper", "contacts[1].xyz", "'soft-finger' takes any"),
-        ({"further": [{"xyz": [0.05, 0.2, 0]}]}, "paper", "contacts[1].xyz", "belongs to 3 pads"),
+        ({"xyz": [0.15, 0, 0]}, "soft-finger", "contacts", "close"),
+        ({"xyz": [0.15, 0, 0]}, "paper", "contacts[1].xyz", "'soft-finger'"),
+        ({"further": [{"xyz": [0.05, 0.2, 0]}]}, "paper", "contacts[1].xyz", "3 pads"),
     ],
 )
 def test_refuses(
@@ -223,10 +223,10 @@ def test_a_slide_is_redundant_by_itself(tmp_path: Path) -> None:
     ("joint", "entry", "told"),
     [
         (PANDA_JOINT, "lower = 1.0, upper = 0.5", "lower <= initial <= upper"),
-        (PANDA_JOINT, "upper = 3.5", "beyond the joint's limits"),
-        (PANDA_JOINT, "initial = [0.1, 0.2]", "array of 3 numbers"),
-        (PANDA_JOINT, "joints = 3", "unknown key"),
-        ("elbow", "initial = 0.1", "joints are: left/panda_joint3, right/panda_joint3"),
+        (PANDA_JOINT, "upper = 3.5", "limits"),
+        (PANDA_JOINT, "initial = [0.1, 0.2]", "3 numbers"),
+        (PANDA_JOINT, "joints = 3", "joints"),
+        ("elbow", "initial = 0.1", "left/panda_joint3, right/panda_joint3"),
     ],
 )
 def test_wrong_entries_are_told(tmp_path: Path, joint: str, entry: str, told: str) -> None:

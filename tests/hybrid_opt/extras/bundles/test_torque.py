@@ -343,15 +343,15 @@ def by(name: str, joints: str = "", **stated: Any) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("job", "told"),
+    ("job", "code", "quoted"),
     [
-        (lambda: by("pandas"), "of fer, fp3, fr3, fr3v2"),
-        (lambda: by("pandas", "fr3", prefix="l"), "has to end with '_'"),
-        (lambda: by("rack"), "driven by abb-egm"),
+        (lambda: by("pandas"), "joint-names", "fer, fp3, fr3, fr3v2"),
+        (lambda: by("pandas", "fr3", prefix="l"), "prefix", "'_'"),
+        (lambda: by("rack"), "no-driver", "abb-egm"),
     ],
 )
-def test_drivers_know_their_arms(job: Callable[[], Any], told: str) -> None:
-    with pytest.raises(SettingsError, match=told):
+def test_drivers_know_their_arms(job: Callable[[], Any], code: str, quoted: str) -> None:
+    with refused(SettingsError, code, quoted):
         target_for("torque", job().workcell).refuse(job(), "torque", any_arm=False)
 
 

@@ -347,8 +347,9 @@ def test_an_arm_elsewhere_is_not_moved_unasked() -> None:
     found = pair(away=0.1)
     found.most = 40.0
     found.run()
-    assert any(line.startswith("popup Move the arm") for line in found.arms[0].log)
-    assert any("program is not there" in line for line in found.arms[1].log), "and the other waits"
+    asked, waits = ([line for line in arm.log if line.startswith("popup ")] for arm in found.arms)
+    assert "first position" in asked[0]
+    assert "program" in waits[0], "and the other waits"
     for arm in found.arms:
         assert arm.log[-1] == "halt"
         assert np.ptp(np.array([row[1] for row in arm.record]), axis=0).max() < 1e-12
