@@ -160,7 +160,6 @@ def test_a_front_prints_and_draws_itself() -> None:
     assert f"{len(front())} carries" in repr(front())
     page = front()._repr_html_()
     assert page.count("<use") > len(front())
-    assert "level and still" in page
 
 
 def test_a_carry_is_timed_and_exported(tmp_path: Path) -> None:

@@ -45,7 +45,8 @@ def test_every_pair_is_there_once_and_the_best_wins(cell: Cell, found: BranchCom
     assert found.pairs[0].hypervolume == max(p.hypervolume for p in found.pairs) > 0.4
     assert found.evaluations == sum(pair.evaluations for pair in found.pairs)
     others = [pair.hypervolume for pair in found.pairs[1:] if pair.rounds]
-    assert ("more than branches" in str(found)) == (max(others) > 0.0)
+    lead = f"{found.pairs[0].hypervolume - max(others):.4f} more"
+    assert (lead in str(found)) == (max(others) > 0.0)
 
 
 def test_halving_gives_the_better_half_more(found: BranchCompetition) -> None:
@@ -103,7 +104,6 @@ def test_drivable_carries_choose_branches_under_the_ramped_law() -> None:
     )
     found = search_branches(cell, evaluations=50, rng=np.random.default_rng(1))
     assert found.law == "ramped"
-    assert "evaluations under the time law ramped" in str(found)
     ramped = Cell(replace(workcell, start_branch=(SEARCHED_BRANCH, -1)))
     assert found == search_branches(ramped, evaluations=50, rng=np.random.default_rng(1))
     assert found.pairs[0].hypervolume > 0.0
@@ -118,8 +118,7 @@ def test_a_decision_is_kept_and_travels_with_the_cell(
     path.write_text(text.replace("min_manipulability = 0.03", searched))
     root = tmp_path / "results"
     root.mkdir()
-    told = store_branches(root, found)
-    assert told.startswith("Start branches 0 and 0")
+    assert str(found).casefold() in store_branches(root, found).casefold()
     execution = ExecutionSettings(output=root, resume=True)
     decided, competition = decided_cell(load(path), CampaignSettings(), execution)
     assert competition == found == read_branches(root)

@@ -139,5 +139,5 @@ def test_a_ramped_carry_rests_at_its_ends() -> None:
         for arm in search_carry(model, x).arms:
             np.testing.assert_allclose(arm.q_rate[[0, -1]], 0.0, atol=1e-6)
         judged = check_search_timing(model, x)
-        assert "at speed" not in judged.reason
+        assert judged.place is None or judged.place.constraint != "start from rest"
     assert check_search_timing(model, cell.initial).status is TimingStatus.OK

@@ -36,6 +36,7 @@ from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_timer import search_carry
 from symbolic.cell_model import CellModel
 from symbolic.parameters import START
+from tests.refusals import refused
 from tests.symbolic.cells import RACK, hand_cell, hand_model, rack_cell
 
 
@@ -73,7 +74,7 @@ def test_a_missing_compiler_is_told_before_any_work(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setenv("CC", "/missing/cc")
-    with pytest.raises(CodegenError, match="no C compiler"):
+    with refused(CodegenError, "no-compiler"):
         CompiledCell(hand_cell())
 
 
@@ -150,7 +151,9 @@ def test_a_machine_without_a_compiler_takes_changed_numbers(tmp_path: Path) -> N
     empty = without | {"DUAL_ARM_CACHE": str(tmp_path / "empty")}
     done = subprocess.run(command, env=empty, capture_output=True, text=True, check=False)
     assert done.returncode != 0
-    assert "no C compiler that works was found" in done.stderr.splitlines()[-1]
+    last = done.stderr.splitlines()[-1]
+    assert last.startswith("codegen.errors.CodegenError: ")
+    assert "apt install" in last
 
 
 @pytest.mark.slow

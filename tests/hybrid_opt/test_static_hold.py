@@ -44,9 +44,9 @@ def changed(name: str, folder: Path, **values: float) -> Path:
     return other
 
 
-def number(text: str, what: str) -> float:
+def number(text: str, unit: str, before: str = "") -> float:
     """A number of the remedy."""
-    found = re.search(rf"{what} ([\d.]+)", text)
+    found = re.search(rf"{before}\b([\d.]+){unit}", text)
     assert found is not None, text
     return float(found[1])
 
@@ -64,9 +64,8 @@ def test_every_cell_that_ships_can_be_held(path: Path) -> None:
 
 def test_needed_allowed_and_remedies_are_told(slippery: Path, tmp_path: Path) -> None:
     why = static_hold_error(load(slippery))
-    assert "left needs a normal force of 981 N at the start, allowed are 117.7 N" in why
-    assert "right needs" in why
-    mass, friction = number(why, "mass of at most"), number(why, "friction of at least")
+    assert re.search(r"left .* 981 N .* 117\.7 N.* right ", why)
+    mass, friction = number(why, " kg"), number(why, "", "friction .*?")
     for lighter in (mass, 1.01 * mass):
         enough = (
             static_hold_error(load(changed("rack", tmp_path, mass=lighter, friction=0.1))) == ""
@@ -83,14 +82,14 @@ def test_the_whole_force_is_the_arms_payload(tmp_path: Path) -> None:
     """At mu = 1 a robot bears 12 kgf in all at 16.97 kg, though it presses with less."""
     assert static_hold_error(load(changed("rack", tmp_path, mass=16.9))) == ""
     why = static_hold_error(load(changed("rack", tmp_path, mass=17.0)))
-    assert "left needs a force in all of" in why
-    assert number(why, "mass of at most") == pytest.approx(16.97, abs=0.01)
+    assert "left" in why
+    assert number(why, " kg") == pytest.approx(16.97, abs=0.01)
 
 
 def test_a_patch_that_would_do_is_told(tmp_path: Path) -> None:
     why = static_hold_error(load(changed("transfer", tmp_path, patch_radius=0.005)))
-    assert "shift of the pressure of 10 mm" in why
-    radius = 1e-3 * number(why, "patches of at least")
+    assert " 10 mm" in why
+    radius = 1e-3 * number(why, " mm radius")
     assert static_hold_error(load(changed("transfer", tmp_path, patch_radius=1.001 * radius))) == ""
     assert static_hold_error(load(changed("transfer", tmp_path, patch_radius=0.98 * radius))) != ""
 
@@ -113,7 +112,7 @@ def test_a_joint_that_is_too_weak_is_told() -> None:
     why = static_hold_error(limited(0.999 * share), cell.evaluator.outputs)
     end, joint = np.unravel_index(int((ends / limit).argmax()), ends.shape)
     assert "joint torque" in why
-    assert f"of {ends[end, joint]:.4g} N m at the {('start', 'goal')[end]}" in why
+    assert re.search(rf" {ends[end, joint]:.4g} N m .*{('start', 'goal')[end]}", why)
     assert static_hold_error(limited(0.999 * share)) == ""  # postures are not known
 
 
@@ -140,7 +139,7 @@ def test_the_inspection_says_infeasible(slippery: Path) -> None:
     parts = inspected(load(slippery), 1, 1)
     part = next(part for part in parts if "unheld" in part.values)
     static_hold_error = part.values["unheld"]
-    assert f"Infeasible, whatever the path: {static_hold_error}" in part.lines
+    assert any(static_hold_error in line for line in part.lines)
     assert "981 N" in static_hold_error
 
 

@@ -73,9 +73,9 @@ def test_results_are_complete_in_order_and_reported_as_they_come(workers: Worker
 
 @on(*LOCAL, DASK)
 def test_errors_end_the_work_but_not_the_workers(workers: Workers) -> None:
-    with pytest.raises(DualArmError, match="this cannot be done"):
+    with pytest.raises(DualArmError, match="misused"):
         workers.map(calls.misuse, [1, 2, 3])
-    with pytest.raises((OSError, RuntimeError), match="a file of the call's own is missing"):
+    with pytest.raises((OSError, RuntimeError), match="own-file"):
         workers.map(calls.mistake, [1, 2, 3])
     assert workers.map(calls.moody, ["a", "b"]) == ["a", "b"]
 

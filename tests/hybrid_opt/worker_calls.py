@@ -37,12 +37,12 @@ def threads(_: object) -> list[int]:
 
 def misuse(_: object) -> None:
     """Raise an error of this project that cannot be pickled as it is."""
-    raise UrdfError("arm.urdf", ("this cannot be done",))
+    raise UrdfError("arm.urdf", ("misused",))
 
 
 def mistake(_: object) -> None:
     """Raise an error that is none of this project's."""
-    raise OSError("a file of the call's own is missing")
+    raise OSError("own-file")
 
 
 def killed_once(file: Path) -> str:

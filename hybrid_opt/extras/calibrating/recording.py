@@ -274,7 +274,9 @@ def _read_arm(table: TableReader, path: Path, workcell: Workcell, arm: int) -> A
 
     def column(name: str) -> Array:
         if name not in columns:
-            raise ResultsError(f"{file}: no column {name!r}; it has {', '.join(columns)[:300]}")
+            raise ResultsError(
+                f"{file}: no column {name!r}; it has {', '.join(columns)[:300]}", code="no-column"
+            )
         return columns[name]
 
     def several(key: str, counts: Sequence[int]) -> Array:
@@ -486,7 +488,9 @@ def read_topics(path: Path, topics: Collection[str]) -> dict[str, Messages]:
             lacking = sorted(set(topics) - set(reader.topics))
             if lacking:
                 has = ", ".join(sorted(reader.topics))[:300]
-                raise ResultsError(f"{path}: no topic {lacking[0]!r}; it has {has}")
+                raise ResultsError(
+                    f"{path}: no topic {lacking[0]!r}; it has {has}", code="no-topic"
+                )
             wanted = [each for each in reader.connections if each.topic in found]
             for connection, stamp, data in reader.messages(wanted):
                 message = reader.deserialize(data, connection.msgtype)
@@ -523,7 +527,9 @@ def joint_series(messages: Messages, names: list[str], path: Path) -> tuple[Arra
     if not rows:
         lacking = next((name for name in names if name not in seen), names[0])
         has = ", ".join(sorted(seen))[:300]
-        raise ResultsError(f"{path}: no joint {lacking!r} in its joint states; they have {has}")
+        raise ResultsError(
+            f"{path}: no joint {lacking!r} in its joint states; they have {has}", code="no-joint"
+        )
     return np.array(times), np.array(rows, dtype=float)
 
 

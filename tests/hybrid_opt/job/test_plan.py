@@ -204,7 +204,7 @@ def changed(**handling: float) -> Job:
     [
         (
             {"set_down_height": 0.02},
-            "set down: 50 %.* payload .*liner, top board",
+            "set down: .*payload .*liner, top board",
         ),
         ({"lift_height": 0.03}, "middle board"),
         ({"stand_off": 1.2}, "approach"),

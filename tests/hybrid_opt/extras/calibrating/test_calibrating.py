@@ -75,8 +75,7 @@ def test_level_holds_at_one_squeeze_show_neither_mass_nor_centre() -> None:
     assert "payload" not in found.changes
     (fault,) = found.faults
     assert fault.serious
-    assert "load not seen" in fault.name
-    assert "three squeezes" in fault.text
+    assert names(found) == {"load not seen"}
     assert "tilted" in " ".join(found.asks)
 
 
@@ -178,7 +177,7 @@ def test_one_run_never_tells_the_friction() -> None:
     found = calibrate(CELL, [changed(made, slip_at=(made.labels.held[-1][1],))])
     assert "contacts" not in found.changes
     assert "friction" not in found.changes["uncertainty"]
-    assert any("two runs" in ask for ask in found.asks)
+    assert any("friction" in ask for ask in found.asks)
 
 
 def test_the_drift_of_the_pads_is_what_plain_kinematics_say() -> None:

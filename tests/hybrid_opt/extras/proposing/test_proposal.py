@@ -94,12 +94,12 @@ def test_the_rack_gets_a_certified_carry(proposal: ho.Proposal, tmp_path: Path) 
 
 def test_what_a_carry_passes_is_told(proposal: ho.Proposal) -> None:
     """A carry that passes nothing need not be straight: the box may leave what it stands on."""
-    assert "-x of top board" in proposal.passes
-    assert f"a carry {proposal.passes}, through" in str(proposal)
+    assert "top board" in proposal.passes
+    assert proposal.passes in str(proposal)
     nothing = replace(proposal, sides=())
     assert nothing.passes == "nothing"
-    assert "a carry through" in str(nothing)
-    assert "no whole job yet: in the way" in str(replace(proposal, blocked="in the way"))
+    assert "nothing" not in str(nothing)
+    assert "the lamp" in str(replace(proposal, blocked="the lamp"))
 
 
 @pytest.mark.parametrize(

