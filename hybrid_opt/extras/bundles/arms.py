@@ -81,7 +81,8 @@ def require_arms(
             raise SettingsError(
                 f"robot {robot.name!r} is described by {robot.urdf.name}, which does not look like "
                 f"an arm of {maker}; {target} is theirs: choose another target, or force it "
-                "(--any-arm) where zero and signs of its joints are the controller's"
+                "(--any-arm) where zero and signs of its joints are the controller's",
+                code="another-maker",
             )
     for robot in workcell.robots:
         turning = turning_joints(arm_model(robot))
@@ -89,7 +90,8 @@ def require_arms(
             slide = "" if all(turning) else f", {turning.count(False)} of them sliding"
             raise SettingsError(
                 f"robot {robot.name!r} has {len(turning)} joints{slide}; targets of {target} "
-                f"hold {' or '.join(map(str, axes))} turning axes, choose another target"
+                f"hold {' or '.join(map(str, axes))} turning axes, choose another target",
+                code="joint-count",
             )
     for robot in workcell.robots:
         if has_address and not robot.driver.address:
@@ -142,7 +144,8 @@ class Lines:
                     raise SettingsError(
                         f"{target} reaches the hands of {robot.name!r} by {self.meaning}; "
                         f'{key} is {found!r}: write [robots.driver] with {key} = "..." into '
-                        f"{SECTION_OF_EACH}"
+                        f"{SECTION_OF_EACH}",
+                        code="hand-lines",
                     )
 
 
@@ -197,7 +200,9 @@ def addressed(workcell: Workcell, addresses: tuple[str, str]) -> Workcell:
     """
     for address in addresses:
         if ADDRESS.problem(address):
-            raise SettingsError(f"address {address!r} is no host name or IP address")
+            raise SettingsError(
+                f"address {address!r} is no host name or IP address", code="wrong-address"
+            )
     robots = zip(workcell.robots, addresses, strict=True)
     first, second = (replace(r, driver=replace(r.driver, address=at)) for r, at in robots)
     return replace(workcell, robots=(first, second))
@@ -245,7 +250,8 @@ def prefixes(workcell: Workcell) -> tuple[str, str]:
         if set(_moving(workcell.robots[0])) & set(_moving(workcell.robots[1])):
             raise SettingsError(
                 f"both drivers have the prefix {stated[0]!r}, so that both arms' joints have the "
-                "same names: give [robots.driver] of each robot a prefix of its own"
+                "same names: give [robots.driver] of each robot a prefix of its own",
+                code="prefix",
             )
         return stated[0], stated[0]
     first, second = (

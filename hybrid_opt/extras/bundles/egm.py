@@ -63,13 +63,15 @@ def require_egm(workcell: Workcell, leader: int) -> None:
         )
         raise SettingsError(
             f"abb-egm would not squeeze: positions alone do not press, and {robot.name!r} is not "
-            f"said to have ABB's Force Control; {remedy}"
+            f"said to have ABB's Force Control; {remedy}",
+            code="no-force-control",
         )
     for robot in robots:
         if not robot.driver.lag > 0.0:
             raise SettingsError(
                 f"abb-egm compensates the lag of {robot.name!r}, 0.01 to 0.08 s by what others "
-                f"measured: write [robots.driver] with lag = ... in seconds into {SECTION_OF_EACH}"
+                f"measured: write [robots.driver] with lag = ... in seconds into {SECTION_OF_EACH}",
+                code="no-lag",
             )
 
 

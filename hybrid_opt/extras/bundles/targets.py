@@ -153,7 +153,8 @@ class Target:
             "nobody states that. Measure it: press both pads against one another, move one by 0.1 "
             "mm a step along the normal and read the force; equal arms have twice its slope. "
             f"Then write [robots.driver] with stiffness = ... in N/m into {SECTION_OF_EACH}, or "
-            "export with --stiffness"
+            "export with --stiffness",
+            code="no-stiffness",
         )
 
 

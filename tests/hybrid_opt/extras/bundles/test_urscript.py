@@ -378,6 +378,5 @@ def test_a_carry_along_the_normals_is_refused() -> None:
     require_followed(rack_job())
     assert normal_speed(along_the_normals(0.179), 0) == pytest.approx(0.179, rel=1e-6)
     require_followed(along_the_normals(0.9 * FOLLOWED))
-    told = r"0.179 m/s along its normal.*slow the carry down 3.6 times, or choose the target torque"
-    with pytest.raises(SettingsError, match=told):
+    with pytest.raises(SettingsError, match=r" 0\.179 m/s .* 3\.6 .*torque"):
         require_followed(along_the_normals(0.179))
