@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +24,7 @@ from tests.hybrid_opt.extras.calibrating.generator import (
     write,
     write_bag,
 )
+from tests.refusals import ended_by
 from tests.symbolic.cells import RACK, standing_text
 
 
@@ -44,11 +46,10 @@ def test_a_written_cell_loads_and_has_the_values(
     assert doubt.tracking == said["uncertainty"]["tracking"]
     assert (doubt.tilt, doubt.friction) == (CELL.uncertainty.tilt, CELL.uncertainty.friction)
     text = out.read_text()
-    assert "# Calibrated from run.csv" in text
-    assert "crosstalk of arm 1" in text
+    assert "run.csv" in text.splitlines()[0]
+    assert "crosstalk" in text
     (line,) = [line for line in text.splitlines() if line.startswith("tracking = ")]
-    assert "# force over command, arm 1" in line
-    assert "; force over command, arm 2" in line
+    assert re.search("# .*arm 1; .*arm 2", line)
     for line in RACK.read_text().splitlines():
         if line.startswith("#"):
             assert line in text
@@ -110,7 +111,7 @@ def test_a_dropout_in_a_file_is_told(
         recording.write_text("\n".join([rows[0], *kept]))
     assert main([str(RACK), str(recording)]) == 0
     said = capsys.readouterr().out
-    assert "warning: run.csv: dropout: nothing new for 0.5" in said
+    assert re.search(r"warning: run\.csv: dropout: .* 0\.5", said)
     assert "from 14 holds" in said
 
 
@@ -130,7 +131,7 @@ def test_a_recording_of_ros_2(
     assert found["changes"]["payload"]["mass"] == pytest.approx(4.4, abs=0.03)
     names = {entry["name"]: entry["found"] for entry in found["entries"]}
     assert float(names["lag of the force, arm 2"].split()[0]) == pytest.approx(0.11, abs=0.02)
-    assert "lag of the force, arm 1" not in names
+    assert not any(name.startswith("lag") and name.endswith("1") for name in names)
 
 
 def test_refusals_end_with_code_one(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -138,15 +139,12 @@ def test_refusals_end_with_code_one(tmp_path: Path, capsys: pytest.CaptureFixtur
     out = tmp_path / "cell.toml"
     untared = replace(made, labels=replace(made.labels, tare=()))
     static_hold_error = replace(short, labels=replace(short.labels, held=((900.0, 902.0),)))
-    for recorded, said in (
-        (untared, "refused: run.csv: missing tare"),
-        (static_hold_error, "dropout: both arms recorded from 0.00 to"),
-    ):
+    for recorded, said in ((untared, "run.csv: missing tare"), (static_hold_error, "dropout: ")):
         assert main([str(RACK), str(write(recorded, tmp_path)), "--out", str(out)]) == 1
         told = capsys.readouterr()
         assert said in told.out
         assert not out.exists()
-    assert f"not written: {out}" in told.err
+    assert str(out) in told.err
 
 
 Edit = Callable[[str], str]
@@ -157,36 +155,37 @@ def put(old: str, new: str) -> Edit:
 
 
 @pytest.mark.parametrize(
-    ("write", "change", "message"),
+    ("write", "change", "code", "quoted"),
     [
-        (write, put("tare", "tara"), "tara: unknown key; did you mean 'tare'"),
-        (write, lambda text: text.replace('"w1_"', '"f1_"'), "no column 'f1_0'"),
-        (write, lambda text: "mass = -1\n" + text, "mass: found -1"),
-        (write, lambda text: text.replace('"pad"', '"tool"'), "frame: found 'tool'"),
-        (write, lambda text: text.rpartition("[[arms]]")[0], "arms: found 1 tables"),
-        (write, put("held = [[", "held = [[9e9, 1], ["), "pairs [begin, end]"),
-        (write, put('joints = "q1_"', "joints = [1, 2]"), "names of 6 columns"),
-        (write_bag, put("/1/wrench", "/3/wrench"), "no topic '/3/wrench'; it has /1/wrench"),
+        (write, put("tare", "tara"), "workcell", "'tare'"),
+        (write, lambda text: text.replace('"w1_"', '"f1_"'), "no-column", "'f1_0'"),
+        (write, lambda text: "mass = -1\n" + text, "workcell", "mass: found -1"),
+        (write, lambda text: text.replace('"pad"', '"tool"'), "workcell", "frame: found 'tool'"),
+        (write, lambda text: text.rpartition("[[arms]]")[0], "workcell", "arms: found 1 "),
+        (write, put("held = [[", "held = [[9e9, 1], ["), "workcell", "[begin, end]"),
+        (write, put('joints = "q1_"', "joints = [1, 2]"), "workcell", "6 columns"),
+        (write_bag, put("/1/wrench", "/3/wrench"), "no-topic", "/1/wrench"),
         (
             write_bag,
             put('"/1/wrench"', '"/1/wrench"\njoints = ["a", "b", "c", "d", "e", "f"]'),
-            "no joint 'a'",
+            "no-joint",
+            "'a'",
         ),
-        (write_bag, put('"/1/wrench"', '"/1/wrench"\njoints = ["a"]'), "names of 6 joints"),
+        (write_bag, put('"/1/wrench"', '"/1/wrench"\njoints = ["a"]'), "workcell", "6 joints"),
     ],
 )
 def test_what_is_wrong_with_a_side_file_is_told(
     tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
     write: Callable[[Recording, Path], Path],
     change: Edit,
-    message: str,
+    code: str,
+    quoted: str,
 ) -> None:
     recording = write(run(0, LEVEL, SQUEEZES[:1]), tmp_path)
     side = recording.with_suffix(".toml")
     side.write_text(change(side.read_text()))
-    assert main([str(RACK), str(recording)]) == 2
-    assert message in capsys.readouterr().err
+    with ended_by(code, quoted):
+        assert main([str(RACK), str(recording)]) == 2
 
 
 def test_damaged_recordings_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

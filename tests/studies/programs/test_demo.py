@@ -13,7 +13,7 @@ pytestmark = pytest.mark.heavy
 
 def test_the_first_result_says_what_is_slow_and_what_was_found() -> None:
     by_hand, front = first_result(evaluations=100)
-    assert re.search(r"held back by its (\w+ \w+, )*joint acceleration", by_hand)
+    assert re.search(r" (\w+ \w+, )*joint acceleration", by_hand)
     rows = [line.split() for line in front.splitlines() if re.match(r"\d+\.\d ", line)]
     assert len(rows) > 2
     times = [(float(row[1]), float(row[2])) for row in rows if row[1] != "-"]

@@ -31,6 +31,7 @@ from symbolic.read.editing import completed
 from symbolic.records import Body, Mesh, Workcell
 from symbolic.records.poses import pose_matrix
 from symbolic.records.task import straight_line
+from tests.refusals import ended_by
 from tests.studies.conftest import TRANSFER
 from tests.symbolic.cells import RACK, standing_text
 
@@ -83,7 +84,6 @@ def test_a_new_cell_needs_no_compiler_and_its_meshes_are_told(
     monkeypatch.setenv("DUAL_ARM_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("CC", "no-such-compiler")
     found = find(cell, 1, 1)
-    assert any("At rest, level" in line for line in found.lines)
     vertices = 8 + len(ball.vertices)
     assert found.meshes == {
         "part.stl": {"parts": 2, "open_parts": 0, "vertices": vertices, "pieces": 1, "corners": 8}
@@ -120,10 +120,10 @@ def test_pictures_are_drawn(found: Inspection) -> None:
 
 def test_the_view_plays_the_hand_made_trajectory(found: Inspection) -> None:
     page = Path(found.view).read_text("utf-8")
-    assert "Transfer over a wall" in page
+    assert load(TRANSFER).name in page
     assert '<div id="note"></div>' in page
     assert '"begin":0.0' in page
-    assert f"View: {found.view} (open it in a browser)" in found.lines
+    assert any(found.view in line for line in found.lines)
 
 
 def test_the_view_of_a_carry_that_fails_begins_there_and_so_does_the_picture(
@@ -159,16 +159,16 @@ def test_the_straight_line_is_straight(transfer: Workcell) -> None:
 
 def test_verdicts_are_told_before_what_takes_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     def later(*given: object, **more: object) -> None:
-        raise AssertionError("too early")
+        raise NotImplementedError
 
     for name in ("_optimum", "draw", "show", "frequent"):
         monkeypatch.setattr(inspection, name, later)
     parts = inspected(load(RACK), 10, 1, Path("pictures"), polish=True, view=Path("view"))
     lines: list[str] = []
-    with pytest.raises(AssertionError, match="too early"):
+    with pytest.raises(NotImplementedError):
         lines.extend(line for part in parts for line in part.lines)
     text = "\n".join(lines)
-    for words in ("At rest, level", "trajectory: feasible", "Straight line: ", "% feasible"):
+    for words in ("trajectory: feasible", "Straight line: ", "% feasible"):
         assert words in text
 
 
@@ -179,8 +179,8 @@ def test_text_and_json_say_the_same_of_a_short_polish_too(
     arguments = [str(RACK), "--candidates", "100", "--no-pictures"]
     assert inspect.main([*arguments, "--polish"]) == 0
     said = capsys.readouterr()
-    assert "short polish: 0 of 1 attempts" in said.err
-    assert re.search(r"\([1-9]\d* points of a short polish\)", said.out)
+    assert "short polish: 0 of 1 " in said.err
+    assert re.search(r"\([1-9]\d* points ", said.out)
     assert inspect.main([*arguments, "--json"]) == 0
     document = json.loads(capsys.readouterr().out)
     assert document["candidates"] == 100
@@ -211,7 +211,7 @@ def test_what_is_in_the_way_is_told_and_nothing_written(
     path.write_text(completed("", data, {}), encoding="utf-8")
     assert propose.main([str(path), "--quiet"]) == BAD_INPUT
     told = capsys.readouterr()
-    assert "payload meets post at the goal" in told.err
+    assert re.search("payload .*post .*goal", told.err)
     assert told.out == ""
     assert [entry.name for entry in tmp_path.iterdir()] == ["cell.toml"]
 
@@ -277,7 +277,7 @@ def test_bodies_are_added_to_a_cell_that_loads(
     assert load(path).environment[-1].name == "shelf board top"
     capsys.readouterr()
     assert scene.main([str(shelf), "--into", str(path)]) == BAD_INPUT
-    assert "'shelf board top' already" in capsys.readouterr().err
+    assert "'shelf board top'" in capsys.readouterr().err
     assert path.read_text(encoding="utf-8") == after
     path.write_text('name = "a"  # of mine\n', encoding="utf-8")
     assert scene.main([str(shelf), "--into", str(path)]) == 0
@@ -291,27 +291,27 @@ def test_what_is_left_out_is_told_by_the_code(
     assert scene.main([str(shelf)]) == 1
     told = capsys.readouterr()
     assert told.out == ""
-    assert told.err.startswith("left out: shelf board top: ")
+    assert "shelf board top: " in told.err
 
 
 @pytest.mark.parametrize(
-    ("cell", "words"),
+    ("cell", "code"),
     [
-        (None, "cell.toml: cannot be read"),
-        ("name = ", "cell.toml: not valid TOML"),
-        ("environment = []\n", "cannot be completed as it is written"),
-        ("environment = 3\n", "cannot be completed as it is written"),
+        (None, "unreadable"),
+        ("name = ", "not-toml"),
+        ("environment = []\n", "not-completable"),
+        ("environment = 3\n", "not-completable"),
     ],
 )
 def test_a_file_that_takes_none_is_left_alone(
-    shelf: Path, cell: str | None, words: str, capsys: pytest.CaptureFixture[str]
+    shelf: Path, cell: str | None, code: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = shelf.with_name("cell.toml")
     if cell is not None:
         path.write_text(cell, encoding="utf-8")
-    assert scene.main([str(shelf), "--into", str(path)]) == BAD_INPUT
+    with ended_by(code):
+        assert scene.main([str(shelf), "--into", str(path)]) == BAD_INPUT
     told = capsys.readouterr().err
-    assert words in told
     assert len(told.splitlines()) == 1
     assert (path.read_text() if path.exists() else None) == cell
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -33,7 +34,7 @@ def test_values_of_a_key(text: str, values: tuple[float, ...]) -> None:
 def test_wrong_values_are_refused(text: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         main.parser().parse_args(["cell.toml", "--over", text])
-    assert "allowed is" in capsys.readouterr().err
+    assert "--over" in capsys.readouterr().err
 
 
 def test_a_key_that_leads_nowhere_is_told_before_the_search(
@@ -50,13 +51,13 @@ def test_a_key_that_leads_nowhere_is_told_before_the_search(
 
 def test_a_sweep_is_stored_listed_and_drawn(tmp_path: Path) -> None:
     rows = (
-        Combination((8.0, 0.5), np.nan, np.nan, np.zeros(0), "it cannot be held"),
+        Combination((8.0, 0.5), np.nan, np.nan, np.zeros(0), "unheld"),
         Combination((8.0, 1.0), 2.5, 90.0, np.ones(3)),
     )
     done = Sweep("digest", {"mass": (8.0,), "friction": (0.5, 1.0)}, np.zeros(3), rows)
     write_json(tmp_path / "sweep.json", to_json(done))
     assert repr(read_sweep(tmp_path / "sweep.json")) == repr(done)
-    assert "mass 8, friction 0.5: it cannot be held" in repr(done)
+    assert re.search(r"mass 8, friction 0\.5: .*unheld", repr(done))
     assert _table(done).rows[1] == ("8", "1", "2.500", "90.0", "")
     left, right = _figure(done).axes
     assert np.ravel(left.lines[0].get_ydata())[1] == 2.5
