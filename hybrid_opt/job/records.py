@@ -300,7 +300,9 @@ def sample_job(job: Job, step: float) -> SampledJob:
         SettingsError: the step is out of range.
     """
     if not LEAST_STEP <= step <= LARGEST_STEP:
-        raise SettingsError(f"time step {step:g} s; allowed is {LEAST_STEP:g} to {LARGEST_STEP:g}")
+        raise SettingsError(
+            f"time step {step:g} s; allowed is {LEAST_STEP:g} to {LARGEST_STEP:g}", code="range"
+        )
     parts = [_sampled(phase, step) for phase in job.phases]
     last = np.cumsum([len(part["time"]) for part in parts]) - 1
     # The sample where two phases meet is the earlier one's last.

@@ -73,9 +73,9 @@ def triangles(path: Path, count: int) -> None:
 
 SHAPES = "<collision><geometry><sphere radius='0.1'/></geometry></collision>" * 3000 + "</link>"
 CASES: dict[str, tuple[str, Callable[[Path], object], str]] = {
-    "a device": ("cell.toml", lambda path: path.symlink_to("/dev/zero"), "it is a device"),
-    "tables": ("cell.toml", lambda path: path.write_bytes(b"[[a]]\n" * 170_000), "a: unknown key"),
-    "a chain": ("a.urdf", lambda path: path.write_text(chain(50_000)), "more than 100000 elements"),
+    "a device": ("cell.toml", lambda path: path.symlink_to("/dev/zero"), "device"),
+    "tables": ("cell.toml", lambda path: path.write_bytes(b"[[a]]\n" * 170_000), "a: "),
+    "a chain": ("a.urdf", lambda path: path.write_text(chain(50_000)), " 100000 "),
     "shapes": (
         "a.urdf",
         lambda path: path.write_text(GOFA.read_text().replace("</link>", SHAPES, 1)),
@@ -87,12 +87,12 @@ CASES: dict[str, tuple[str, Callable[[Path], object], str]] = {
     "values": (
         "t.json",
         lambda path: path.write_bytes(b"[" + b"[]," * 3_000_000 + b"1]"),
-        "more than 1000000 values",
+        " 1000000 ",
     ),
     "letters": (
         "t.json",
         lambda path: path.write_bytes(b'["' + "\U0001f600".encode() * 10_000_000 + b'"]'),
-        "`format` is not",
+        "`format`",
     ),
 }
 ALWAYS = ("triangles", "values")

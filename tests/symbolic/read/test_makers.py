@@ -54,8 +54,8 @@ def test_joints_that_arms_move_need_theirs(tmp_path: Path) -> None:
     assert text.count(limit) == 2
     path = Torso().problem(tmp_path)
     for wanted, told in (
-        ('<limit lower="-3.0" upper="3.0" velocity="2.5"/>', r"torque_max: .* gives 0 for joint 5"),
-        ("", r"position_lower\[4\]: found 0 rad for joint 'left_joint_3', not below"),
+        ('<limit lower="-3.0" upper="3.0" velocity="2.5"/>', r"torque_max: .*joint 5"),
+        ("", r"position_lower\[4\]: found 0 rad .*'left_joint_3'"),
     ):
         (tmp_path / "torso.urdf").write_text(text.replace(limit, wanted), encoding="utf-8")
         with pytest.raises(WorkcellError, match=told):
@@ -106,7 +106,7 @@ def test_a_torso_may_have_as_many_joints_as_it_likes(tmp_path: Path) -> None:
 
 def test_efforts_of_zero_are_no_torques_until_the_file_says_unknown(tmp_path: Path) -> None:
     torso = Torso(effort=0.0)
-    told = r'torque_max: .* gives 0 for joint 2.* torque_max = "unknown" to judge without torques'
+    told = r'torque_max: .*joint 2.* torque_max = "unknown"'
     with pytest.raises(WorkcellError, match=told):
         cell(torso, tmp_path)
     _warn_unjudged.cache_clear()

@@ -277,7 +277,7 @@ REFUSED: list[tuple[str, Callable[[], Job | Timing], dict[str, Any], str, str]] 
     ("xml", by, {}, "unknown-target", "'xml'"),
     ("abb-rapid", by, {}, "former-target", "abb-egm"),
     ("data", lambda: replace(rack_timing(), carry=None), {}, "no-timing", ""),
-    ("data", by, {"step": -1.0}, "step", "-1"),
+    ("data", by, {"step": -1.0}, "range", "-1 s"),
     ("data", by, {"skew": -1.0}, "skew", "-1"),
 ]
 
