@@ -49,7 +49,7 @@ def test_a_written_cell_loads_and_has_the_values(
     assert "run.csv" in text.splitlines()[0]
     assert "crosstalk" in text
     (line,) = [line for line in text.splitlines() if line.startswith("tracking = ")]
-    assert re.search("# .*arm 1; .*arm 2", line)
+    assert re.search("# .*arm 1: .*; .*arm 2: ", line)
     for line in RACK.read_text().splitlines():
         if line.startswith("#"):
             assert line in text
