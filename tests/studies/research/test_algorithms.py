@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -61,21 +62,21 @@ def test_json_repeats_to_the_digit(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "quoted"),
     [
-        (["--problems", "zdt9"], "unknown test problem 'zdt9'"),
-        (["--algorithms", "pso"], "unknown algorithm 'pso'"),
-        (["--seeds", "0"], "at least 1 seed"),
-        (["--evaluations", "99"], "100 evaluations (the population)"),
+        (["--problems", "zdt9"], "'zdt9'"),
+        (["--algorithms", "pso"], "'pso'"),
+        (["--seeds", "0"], " 1 "),
+        (["--evaluations", "99"], "100 evaluations"),
         (["--population", "0", "--problems", "tnk"], "swarm is 0"),
     ],
 )
 def test_wrong_arguments(
-    arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], quoted: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert algorithms.main(arguments) == 2
     error = capsys.readouterr().err
-    assert message in error
+    assert quoted in error
     assert len(error.splitlines()) == 1
 
 
@@ -130,7 +131,8 @@ def test_a_small_comparison(tmp_path: Path) -> None:
     (one,) = compare(cell, 4, 1, 60, 1)
     assert len(one.locked) == 4
     assert one.best == locks(cell.workcell.task, 4)[int(np.argmax(one.locked))]
-    assert "free beats the best lock in" in as_text([one])
+    better = int(one.free > max(one.locked))
+    assert re.search(rf"\b{better} of 1\b", as_text([one]).splitlines()[-1])
 
 
 def test_a_cell_without_redundant_joints_has_nothing_to_compare() -> None:
