@@ -84,11 +84,11 @@ class CSource:
 
     @classmethod
     def of(cls, name: str, function: ca.Function, lanes: int, level: int | None) -> CSource:
-        """Generate the C text of a CasADi function.
+        """Generate the C text of a CasADi function, under the name `name` in its set.
 
-        If the function has no form in lanes, a warning is given and the text has one lane. For
-        `level` None the size of the generated text decides the optimisation level. The function is
-        called `name` in its set.
+        The text evaluates `lanes` inputs side by side; a function without a form in lanes gets one
+        lane, with a warning. `level` is the compiler's optimisation level; for None the size
+        decides.
         """
         from codegen.source import c_source, dense, generated_c, operations
 
@@ -335,7 +335,7 @@ def _stored(tape: Tape, cache: Cache) -> StoredTape:
 
 
 def _member(key: str, cache: Cache) -> Library | StoredTape | None:
-    """Load the library or tape stored under a key; None if there is none that can be loaded."""
+    """Load the library or tape stored under a key of the cache; None if none can be loaded."""
     entry = cache.find(key)
     if entry is None or entry.library.suffix != TAPE_SUFFIX:
         return _loaded(key, cache)
@@ -442,9 +442,10 @@ def _obtained(
     cache: Cache,
     load: Callable[[str, Cache], Member | None],
 ) -> dict[str, Member]:
-    """Load all libraries or tapes that the record under `key` names, by name.
+    """Load all libraries or tapes that the cache's record under `key` names, by name.
 
-    If the record or one of them is missing, make all and store the record.
+    `load` loads one of them by its own key. If the record or one of them is missing, `make` makes
+    all, and the record is stored.
     """
 
     def find() -> dict[str, Member] | None:
@@ -474,7 +475,7 @@ def _remember(key: str, built: Mapping[str, Library | StoredTape], cache: Cache)
 
 
 def _loaded(key: str, cache: Cache) -> Library | None:
-    """Load the library stored under a key; None if there is none that can be loaded."""
+    """Load the library stored under a key of the cache; None if none can be loaded."""
     entry = cache.find(key)
     try:
         return None if entry is None else Library(entry, ctypes.CDLL(str(entry.library)))
@@ -485,9 +486,10 @@ def _loaded(key: str, cache: Cache) -> Library | None:
 def _compiled(
     sources: Iterable[CSource], cache: Cache, *, rebuild: bool = False
 ) -> dict[str, tuple[Library, bool]]:
-    """Compile sources. Return for each name the library, and True if it was in the cache.
+    """Compile sources in parallel, or take their libraries from the cache unless `rebuild`.
 
-    Compilers run in parallel, already while later sources are generated.
+    Returns:
+        By the name of the source: the library, and True if it was in the cache.
     """
     compiler = compiler_of(cache)
     with ThreadPoolExecutor(available_cores()) as pool, interruptible():
@@ -510,10 +512,10 @@ def _compiled(
 def _begin(
     source: CSource, compiler: Compiler, cache: Cache, pool: ThreadPoolExecutor, rebuild: bool
 ) -> Future[tuple[Library, bool]]:
-    """Start to compile a source in the pool.
+    """Start to compile a source in the pool's threads; give its library, and True if it was cached.
 
-    The pool starts work in order, so the object files of separate functions are begun before the
-    library that links them.
+    If `rebuild`, the source is compiled even if it is cached. The pool starts work in order, so the
+    object files of separate functions are begun before the library that links them.
     """
     flags = () if source.lanes == 1 else LANE_FLAGS
     rest, parts = in_parts(source.text, source.lanes, source.most)
@@ -579,7 +581,7 @@ def _require_sound(compiler: Compiler, cache: Cache) -> None:
 
 
 def _object(part: CodePart, compiler: Compiler, cache: Cache) -> Path:
-    """Return a part's object file, compiled if the cache lacks it."""
+    """Return the object file of a part of C code, compiled by `compiler` if the cache lacks it."""
     flags = (*FLAGS, *LANE_FLAGS)
     key = key_of("part", compiler=compiler.identity, level=part.level, flags=flags, text=part.text)
 

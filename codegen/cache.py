@@ -118,8 +118,11 @@ class _Undocumented(ast.NodeTransformer):
 
 
 def _sources(packages: Sequence[str]) -> Iterator[tuple[str, Path]]:
-    """Yield every source file of packages or modules, with a name that does not depend on the
-    folder of installation."""
+    """Yield (name, path) of every source file of packages or modules.
+
+    The name is the package and the file's own name; it does not depend on the folder of
+    installation.
+    """
     for package in packages:
         spec = importlib.util.find_spec(package)
         if spec is None:
@@ -231,7 +234,9 @@ class Cache:
         return CacheEntry(key, library, facts)
 
     def read_record(self, key: str) -> dict[str, Any] | None:
-        """Return the record stored under this key, or None if it is missing or damaged."""
+        """Return the JSON object that `write_record` stored under a key; None if missing or
+        damaged.
+        """
         self._require_safe()
         raw = self._read_own(self.folder / f"{key}.json")
         if raw is None:
@@ -251,7 +256,7 @@ class Cache:
         return facts
 
     def write_record(self, key: str, facts: Mapping[str, Any]) -> None:
-        """Store a record under a key, with its checksum, in one step."""
+        """Store a JSON object `facts` under a key, with its checksum, in one step."""
         text = json.dumps({"facts": facts, "sha256": digest(_canonical(facts))}, indent=1)
         self._make_folder()
         with _writing(self.folder):
@@ -349,7 +354,7 @@ class Cache:
         return libraries
 
     def _by_use(self) -> list[tuple[float, int, list[Path]]]:
-        """Return for each key the time of last use, the size and the files, oldest first."""
+        """Return (time of last use [s], total size [bytes], files) of every key, oldest first."""
         found: dict[str, tuple[float, int, list[Path]]] = {}
         if self.folder.exists():
             self._require_safe()

@@ -269,7 +269,9 @@ _warned = False
 
 
 def cannot_load(name: str, error: Exception) -> CodegenError:
-    """Build the error for a library of the cache that cannot be loaded, with the remedy."""
+    """Build the error, with the remedy, for the cached library of the function `name`, which
+    `error` kept from being loaded.
+    """
     return CodegenError(
         f"{name}: the compiled library cannot be loaded: {error}; if its folder does not allow "
         "programs, name another one in the environment variable DUAL_ARM_CACHE",
@@ -278,7 +280,9 @@ def cannot_load(name: str, error: Exception) -> CodegenError:
 
 
 def warn_one_lane(name: str, reason: str) -> None:
-    """Warn once per process that a function runs one evaluation at a time."""
+    """Warn once per process that the function `name` runs one evaluation at a time, for a
+    `reason`.
+    """
     global _warned
     if _warned:
         return

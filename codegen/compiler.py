@@ -365,7 +365,7 @@ def _find(cc: str, path: str) -> Compiler | None:
 
 
 def _ask(command: tuple[str, ...], *arguments: str) -> str | None:
-    """Return the output of a command for these arguments; None if it fails."""
+    """Return what a command prints when called with further arguments; None if it fails."""
     try:
         said = subprocess.run(
             [*command, *arguments],

@@ -261,10 +261,16 @@ class NumericFunction(ABC):
     def _prepared(
         self, inputs: Sequence[Array], batched: Sequence[bool], outputs: Sequence[Array]
     ) -> tuple[Callable[[int], None], Callable[[], NativeCall] | None]:
-        """Return a function that evaluates the first items of a batch, given their number.
+        """Prepare repeated evaluations of one batch, whose arrays stay at their addresses.
 
-        The second result is a function that returns addresses for C; None if C cannot evaluate the
-        batch.
+        Args:
+            inputs: input arrays of the batch.
+            batched: for each input, True if it has one value per evaluation.
+            outputs: arrays for the results.
+
+        Returns:
+            A function that evaluates the first k items of the batch, given k; and a function that
+            returns the addresses for C, or None if C cannot evaluate the batch.
         """
 
         def run(count: int) -> None:
@@ -274,7 +280,10 @@ class NumericFunction(ABC):
 
     @abstractmethod
     def _evaluate_block(self, inputs: Sequence[Array], block: NDArray[np.void]) -> None:
-        """Evaluate once. All outputs are written into one record of `Signature.output_record`."""
+        """Evaluate once for the arrays `inputs`, and write all outputs into the record `block`.
+
+        The record has the type `Signature.output_record`.
+        """
 
     @abstractmethod
     def _evaluate_batch(
@@ -285,7 +294,15 @@ class NumericFunction(ABC):
         n: int,
         threads: int,
     ) -> None:
-        """Evaluate n > 0 candidates. `batched` is True for inputs with one value per candidate."""
+        """Evaluate a batch of n > 0 candidates, and write the results into `outputs`.
+
+        Args:
+            inputs: input arrays.
+            batched: for each input, True if it has one value per candidate.
+            outputs: arrays for the results, with one value per candidate.
+            n: number of candidates.
+            threads: number of threads that share the batch.
+        """
 
     def _require_count(self, given: int) -> None:
         if given != len(self.input_names):

@@ -171,9 +171,10 @@ def directional_derivative(function: ca.Function) -> ca.Function:
 
 
 def relative_difference(reference: Array, other: Array) -> float:
-    """Compute max abs(reference - other) over the largest finite abs(reference).
+    """Compute the largest difference of two arrays, relative to the largest entry of `reference`.
 
-    The divisor is at least `RESIDUE`. The result is infinite if NaN or infinite entries differ.
+    This is max abs(reference - other) over max abs(reference), both over the finite entries; the
+    divisor is at least `RESIDUE`. The result is infinite if the NaN or infinite entries differ.
     """
     finite = np.isfinite(reference)
     if not np.array_equal(reference[~finite], other[~finite], equal_nan=True):

@@ -190,9 +190,7 @@ def _cut(found: re.Match[str]) -> str:
 
 
 def _used(piece: list[str]) -> tuple[set[str], set[str]]:
-    """Return the variables that C lines read before they set them, and the variables that
-    they set.
-    """
+    """Return two sets of variables in lines of C: those read before they are set, and those set."""
     read, written = set[str](), set[str]()
     for line in piece:
         variables = _VARIABLE.findall(line)

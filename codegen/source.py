@@ -115,8 +115,9 @@ def program_source(functions: Mapping[str, ca.Function], own: str, lanes: int = 
 
 
 def _lanes_header(lanes: int) -> list[str]:
-    """Return the C types of lanes, for the given number of lanes or, for 0, the width of the
-    machine."""
+    """Return pieces of C text that define the types of lanes; for `lanes` = 0 with the machine's
+    width.
+    """
     width = f"#define DUAL_ARM_LANES {lanes}\n" if lanes else ""
     return [runtime("one_lane.h"), width, runtime("lanes.h")]
 
@@ -176,8 +177,13 @@ def generated_c(functions: Sequence[ca.Function]) -> str:
 
 
 def _filled(driver: str, signature: Signature, generated: str = "") -> str:
-    """Fill the placeholders of a driver with a function's names and sizes, and whether its C keeps
-    state."""
+    """Fill the placeholders of a driver's C text for one function.
+
+    Args:
+        driver: C text with placeholders.
+        signature: name and sizes of the function.
+        generated: C code of the function, searched for whether it keeps state.
+    """
     inputs = [prod(shape) for shape in signature.input_shapes]
     outputs = [prod(shape) for shape in signature.output_shapes]
     return (

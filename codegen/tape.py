@@ -33,7 +33,7 @@ output the operands are its place."""
 
 @cache
 def compiled_tape() -> Any:
-    """Load the C++ extension module that runs tapes.
+    """Import the C++ extension module that runs tapes, and return the module.
 
     Raises:
         BridgeError: the module is missing or cannot be loaded.

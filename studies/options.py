@@ -227,7 +227,8 @@ FILM_FILE = PathType(_require_film)
 
 
 def check_paths(parser: argparse.ArgumentParser, options: argparse.Namespace) -> None:
-    """Check every path of a command line, inputs first in the order of the help.
+    """Check all paths in the parsed `options` of a command line, inputs first, in the order of the
+    help.
 
     Raises:
         DualArmError: a path is not suitable for the program.

@@ -220,7 +220,12 @@ class Program:
         return parser
 
     def __call__(self, arguments: Sequence[str] | None = None, called: str = "") -> int:
-        """Run the program with a command line, None for the process's own. Return the exit code."""
+        """Run the program and return its exit code.
+
+        Args:
+            arguments: words of the command line; None for those of this process.
+            called: name of the command for messages; '' for the usual one.
+        """
         parser = self.parser(called)
         given = list(sys.argv[1:] if arguments is None else arguments)
 
@@ -240,7 +245,10 @@ class Program:
 
 
 def _done(name: str, options: argparse.Namespace) -> int:
-    """Import a function by name and call it with libraries in one thread. Return its exit code."""
+    """Import a function by its dotted name, call it with the parsed options, return its exit code.
+
+    Numerical libraries run in one thread meanwhile.
+    """
     from hybrid_opt.workers import one_thread
 
     module, _, function = name.rpartition(".")

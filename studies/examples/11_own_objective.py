@@ -13,7 +13,12 @@ import hybrid_opt as ho
 
 
 def height(outputs: Mapping[str, np.ndarray], workcell: ho.Workcell) -> np.ndarray:
-    """Compute the largest height of the box over the goal's, one value per candidate."""
+    """Compute the largest height of the box over twice the height of its goal, one per candidate.
+
+    Args:
+        outputs: results of the evaluation by name, with one entry per candidate.
+        workcell: the cell.
+    """
     goal = workcell.task.waypoints[-1].lower[2]
     return np.asarray(outputs["pose"][:, :, 2].max(axis=1) / (2.0 * goal))
 

@@ -81,7 +81,7 @@ class CampaignComparison:
 
 
 def compare(first: Path, second: Path) -> CampaignComparison:
-    """Compare two results folders.
+    """Compare the campaigns in two results folders.
 
     Raises:
         ResultsError: a folder is not a finished campaign, they share no algorithm, or they
@@ -138,7 +138,15 @@ def _values(
     run: CampaignResults, name: str, summary: CampaignSummary, reference: Array
 ) -> dict[str, list[float]]:
     """Return the figures of one algorithm by name, each as a list with one value per replica.
-    Figures of polished fronts come last."""
+
+    Figures of polished fronts come last; their names have a prefix.
+
+    Args:
+        run: results of the campaign.
+        name: name of the algorithm.
+        summary: stored summary of the campaign.
+        reference: points (k, n_obj) of the reference front, by which indicators are computed anew.
+    """
     stored = summary.algorithms[name].replicas
     better = [row.polished for row in stored if row.polished is not None]
     values: dict[str, list[float]] = {}
@@ -161,8 +169,9 @@ def _compared(name: str, figure: str, first: Array, second: Array) -> ComparedFi
 
 
 def _with_holm(figures: list[ComparedFigure]) -> tuple[ComparedFigure, ...]:
-    """Return the figures with the p-values of their rank tests corrected for multiple testing by
-    Holm's method."""
+    """Return the figures with the p-values of their rank tests corrected by Holm's method for the
+    number of tests.
+    """
     tests = iter(corrected([figure.test for figure in figures if figure.test is not None]))
     return tuple(
         figure if figure.test is None else replace(figure, test=next(tests)) for figure in figures
@@ -210,7 +219,7 @@ def as_text(found: CampaignComparison) -> str:
 
 
 def _quantity(figure: str) -> tuple[str, Quantity]:
-    """Return the name of a figure for people, and the format of its values."""
+    """Return a figure's name for people, and the format of its values."""
     quantity = REPLICA_QUANTITIES[figure.removeprefix(POLISHED_PREFIX)]
     of = "polished, " if figure.startswith(POLISHED_PREFIX) else ""
     return f"{of}{quantity.heading()}", quantity

@@ -64,13 +64,14 @@ def inspected(
     """Yield all findings about a cell. Each is computed when it is requested.
 
     Args:
-        candidates: number of random candidates, at least 1.
         workcell: the cell.
+        candidates: number of random candidates, at least 1.
         seed: seed of the random candidates.
         output: folder for the pictures; None to draw none.
         polish: True to polish the hand-made trajectory briefly, to find active bounds.
         view: file for a page that shows the hand-made trajectory; None for none.
         pairs: True to list every pair of bodies.
+        progress: receives messages on the progress of the polish; None for none.
 
     Raises:
         DualArmError: the model cannot be built, or a picture cannot be written.

@@ -101,6 +101,10 @@ def _built(
     """Compile the functions of the evaluator, and compare them with their interpreted expressions.
 
     Args:
+        cell: the cell.
+        sets: function sets to compile.
+        cache: cache that keeps the libraries.
+        options: parsed command line.
         found: list to which the comparisons are added.
     """
     from symbolic.parameters import GROUPS

@@ -167,6 +167,10 @@ def run_study(
 
     Args:
         workcell: the cell; it is read again from its file.
+        settings: settings of the campaign, which determine its results.
+        execution: settings without influence on the results, such as the number of processes.
+        progress: receives messages on the progress.
+        study: choice of the stages and their settings.
 
     Raises:
         DualArmError: the workcell, a setting or the results folder is invalid, or a stage failed.
@@ -207,6 +211,7 @@ def study_text(root: Path, with_paper: bool, brief: bool = False) -> str:
     """Format the figures of a finished study for a terminal, with the recommended carry first.
 
     Args:
+        root: results folder of the study.
         with_paper: True to show the paper's values beside those of the study.
         brief: True to show only the recommended carry, if there is one.
 

@@ -89,7 +89,7 @@ def _of_file(cell: Cell, path: Path) -> Array:
 
 
 def _table(done: Sweep, longest: int = sys.maxsize) -> Table:
-    """Build the table of a sweep, with remarks cut to `longest` characters."""
+    """Build the table of a finished sweep `done`, with remarks cut to `longest` characters."""
     rows = [
         (
             *(f"{v:g}" for v in row.values),

@@ -117,11 +117,15 @@ def _replayed(
 
 
 def _driven(cell: Cell, x: Array) -> ProgramResult:
-    """Plan the job around a drivable carry with the default settings of a study and an export, and
-    return its figures.
+    """Plan the job around a drivable carry, with the default settings of studies and exports.
 
     Args:
+        cell: the cell.
         x: (n_var,) decision vector of the carry.
+
+    Returns:
+        Duration of carry and job [s] and commanded force [N]; or the reason why no job can be
+        planned.
     """
     try:
         job = job_model(cell.timing_model).plan(driven_timing(cell.timing_model, x))

@@ -162,8 +162,16 @@ def _run(
 
 
 def _band(problem: str, evaluations: int, algorithm: str, population: int) -> Band | None:
-    """Return the reference band for an algorithm, population and budget, None without one. The
-    bands are for Coello's MOPSO and its variant."""
+    """Return the published reference band for an algorithm on a problem, None if there is none.
+
+    Bands exist for Coello's MOPSO and its variant.
+
+    Args:
+        problem: name of the test problem.
+        evaluations: budget of evaluations.
+        algorithm: name of the algorithm.
+        population: size of the population.
+    """
     applies = algorithm.startswith("mopso") and population == BAND_POPULATION
     return BANDS.get((problem, evaluations)) if applies else None
 
@@ -396,8 +404,9 @@ def make(name: str) -> AnalyticProblem:
 
 
 def _evenly(curve: Array) -> Array:
-    """Return the non-dominated part of a dense curve, resampled at equal arc lengths of its
-    pieces."""
+    """Return the non-dominated points (k, 2) of a dense curve, at equal arc lengths along each
+    connected piece.
+    """
     front = moocore.filter_dominated(curve)
     front = front[np.argsort(front[:, 0], kind="stable")]
     step = np.linalg.norm(np.diff(front / np.ptp(front, axis=0), axis=0), axis=1)
@@ -425,8 +434,10 @@ def _zdt3_front() -> Array:
 
 
 def _tnk_front() -> Array:
-    """Sample the reference front of TNK: the curved constraint is active, and the circular one cuts
-    pieces out."""
+    """Sample the reference front (k, 2) of the test problem TNK.
+
+    The curved constraint is active on the front; the circular constraint cuts pieces out.
+    """
     angle = np.linspace(0.0, 0.5 * np.pi, _DENSE)
     # arctan(x1 / x2) is the angle from the x2 axis.
     radius = np.sqrt(1.0 + 0.1 * np.cos(16.0 * angle))
@@ -448,8 +459,10 @@ def _srn_front() -> Array:
 
 
 def _osy_front() -> Array:
-    """Sample the reference front of OSY, five pieces with x4 = x6 = 0 (Deb 2001, Multi-objective
-    optimization, section 8.3.3)."""
+    """Sample the reference front (k, 2) of the test problem OSY: five pieces with x4 = x6 = 0.
+
+    Source: Deb 2001, Multi-objective optimization, section 8.3.3.
+    """
     s = np.linspace(0.0, 1.0, _DENSE // 5)
     one, zero = np.ones_like(s), np.zeros_like(s)
     bend = np.linspace(37.0 / 9.0 - 1.0 / 18.0, 5.0, len(s))

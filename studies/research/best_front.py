@@ -64,13 +64,16 @@ def compute_reference_front(
     jobs: int = 1,
     tell: Callable[[str], None] = lambda text: None,
 ) -> ReferenceFront:
-    """Polish from many starts, then the union of the results.
+    """Polish a cell's front from many start candidates, then the union of the results.
 
     Args:
-        evaluator: with the paper's objectives.
-        starts: random feasible candidates to start from, the hand-made trajectory besides.
-        attempts: of the final polish of the union.
-        jobs: worker processes, 0 for one per core; has no influence on the result.
+        evaluator: evaluator of the cell, with the paper's objectives.
+        starts: number of random feasible candidates to start from, besides the hand-made
+            trajectory.
+        attempts: number of attempts of the final polish of the union.
+        rng: source of the random candidates.
+        jobs: number of worker processes, 0 for one per core; no influence on the result.
+        tell: function that receives messages on the progress.
 
     Raises:
         SettingsError: too few random candidates are feasible.
@@ -115,7 +118,15 @@ def _polished(
 
 
 def encode(front: ReferenceFront, command: str) -> bytes:
-    """Write the file: two comment lines, a header, one line per point."""
+    """Return the content of a reference front's file in CSV.
+
+    Two comment lines state the command that made the front and the workcell's digest. A header and
+    one line per point follow, with both peak forces and the decision vector.
+
+    Args:
+        front: the reference front.
+        command: command line that made the front.
+    """
     n_var = front.x.shape[1]
     lines = [
         f"# made with: {command}",

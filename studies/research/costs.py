@@ -81,8 +81,16 @@ def _workcell(path: Path | None) -> Workcell:
 def benchmark(
     workcell: Workcell, candidates: int = 10, repeats: int = 3, seed: int = 0
 ) -> dict[str, Any]:
-    """Measure the evaluation of one cell at random decision vectors, in several rounds. All times
-    are in milliseconds per candidate.
+    """Measure the evaluation of one cell at random decision vectors, in several rounds.
+
+    Args:
+        workcell: the cell.
+        candidates: number of batches of candidates.
+        repeats: number of rounds.
+        seed: seed of the candidates.
+
+    Returns:
+        Figures by name: the cell, the machine and times in milliseconds per candidate.
 
     Raises:
         CodegenError: there is no compiler.
@@ -131,7 +139,18 @@ def benchmark(
 
 def _scaling(model: CellModel, candidates: int, repeats: int, seed: int) -> dict[str, Any]:
     """Measure how the time of the compiled evaluation grows with the number of samples and of free
-    waypoints."""
+    waypoints.
+
+    Args:
+        model: model of the cell.
+        candidates: number of batches of candidates.
+        repeats: number of rounds.
+        seed: seed of the candidates.
+
+    Returns:
+        Times [ms] by number of samples, the straight line through them, and times by number of free
+        waypoints.
+    """
     task = model.workcell.task
     by_samples = {n: replace(task, samples=n) for n in SAMPLE_COUNTS}
     by_waypoints = {n: with_free_waypoints(task, n) for n in WAYPOINTS}
@@ -168,8 +187,19 @@ def _costs(
     seed: int,
     what: str,
 ) -> dict[int, Array]:
-    """Return the time per candidate of each task's compiled evaluator (rounds,) [s]. The tasks are
-    measured in turns."""
+    """Measure the time per candidate of the compiled evaluator of several tasks, in turns.
+
+    Args:
+        model: model of the cell, whose task is replaced.
+        tasks: tasks by the number that distinguishes them.
+        candidates: number of candidates.
+        repeats: number of rounds.
+        seed: seed of the candidates.
+        what: name of this number, for messages, such as 'samples'.
+
+    Returns:
+        Times (rounds,) [s] of each task, by its number.
+    """
     ways: dict[str, Evaluate] = {}
     x: dict[str, Array] = {}
     for n, task in tasks.items():
@@ -181,10 +211,10 @@ def _costs(
 
 
 def with_free_waypoints(task: Task, count: int) -> Task:
-    """Return the task with another number of free waypoints between start and goal.
+    """Return the task with `count` free waypoints between start and goal.
 
-    They are spread evenly along the polygon of the hand-made trajectory. Each may deviate as far as
-    the original waypoint with the narrowest bounds.
+    The waypoints are spread evenly along the polygon of the hand-made trajectory. Each may deviate
+    as far as the original waypoint with the narrowest bounds.
     """
     points = np.array([waypoint.lower for waypoint in task.waypoints])
     points[list(task.free_indices)] = task.initial
@@ -288,7 +318,13 @@ _ROOT = Path(__file__).resolve().parents[1]
 
 @dataclass(frozen=True)
 class StageTime:
-    """Core-seconds of one stage of a study: `seconds` without the profiler, and by part with it."""
+    """Core-seconds of one stage of a study.
+
+    Attributes:
+        name: name of the stage.
+        seconds: core-seconds without the profiler.
+        parts: core-seconds with the profiler, by part.
+    """
 
     name: str
     seconds: float
@@ -296,8 +332,15 @@ class StageTime:
 
 
 def profile_study(workcell: Workcell, seed: int) -> tuple[StageTime, ...]:
-    """Measure the core-seconds of one replica of NSGA-II, of the polish of a part of its front, and
-    of the timing of one carry."""
+    """Measure the core-seconds of three stages of a study.
+
+    These are one replica of NSGA-II, the polish of a part of its front, and the timing of one
+    carry.
+
+    Args:
+        workcell: the cell.
+        seed: seed of search and polish.
+    """
     cell = Cell(workcell)
     progress("compiling what the stages need")
     cell.evaluator.evaluate(cell.initial[None])
@@ -342,7 +385,12 @@ def _timed(name: str, run: Callable[[], object]) -> StageTime:
 
 
 def _part(file: str, function: str) -> str:
-    """Return the package of this project, or the library, to which a profiled function belongs."""
+    """Return the package of this project, or the library, to which a profiled function belongs.
+
+    Args:
+        file: path of the file with the function.
+        function: name of the function.
+    """
     path = Path(file)
     if path.is_relative_to(_ROOT):
         return "/".join(path.relative_to(_ROOT).parts[:2]).removesuffix(".py")

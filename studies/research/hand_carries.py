@@ -82,8 +82,13 @@ class HandThreshold:
 
 
 def draw(kind: str, rng: np.random.Generator, least_swings: float = SWINGS) -> Carry:
-    """Return a random payload in hands of a kind with a random carry, in which the payload would
-    oscillate at least `least_swings` times."""
+    """Return a random carry of a random payload in hands.
+
+    Args:
+        kind: kind of the hands.
+        rng: source of the random numbers.
+        least_swings: least number of oscillations of the payload in its hands during the carry.
+    """
     while True:
         workcell = _draw_cell(kind, rng)
         turned = rng.uniform(-0.4, 0.4, 3) * rng.integers(0, 2)
@@ -114,8 +119,12 @@ def _rough(contact: Contact) -> Contact:
 def threshold(kind: str, carry: Carry) -> HandThreshold:
     """Find the least holding force with which a carry succeeds in the simulator.
 
-    The search starts where the contact model expects the threshold. It is repeated in a wide range
+    The search starts where the contact model expects the threshold, and is repeated in a wide range
     if the threshold is not there.
+
+    Args:
+        kind: kind of the hands, stored in the result.
+        carry: the carry of a payload in hands.
     """
     workcell = carry.workcell
     needed, rims = needed_force(carry), rims_share(carry)
@@ -139,14 +148,22 @@ def threshold(kind: str, carry: Carry) -> HandThreshold:
 
 
 def _steps(low: float, high: float) -> int:
-    """Return the bisections that narrow a range down to the resolution."""
+    """Return the number of bisections that narrow the range from `low` to `high` down to the
+    resolution.
+    """
     return int(np.ceil(np.log2((high - low) / RESOLUTION)))
 
 
 def carry_along(workcell: Workcell, path: Array, duration: float) -> Carry:
-    """Return a carry that changes the pose by `path` (6,) from rest to rest, without forces.
+    """Return a carry without forces that moves the box from rest to rest along a straight pose
+    change.
 
     The motion is the quintic 10 s^3 - 15 s^4 + 6 s^5.
+
+    Args:
+        workcell: the cell.
+        path: (6,) change of the pose from start to goal [m, rad].
+        duration: duration of the motion [s].
     """
     s = np.linspace(0.0, 1.0, QUINTIC_SAMPLES)
     place = 10 * s**3 - 15 * s**4 + 6 * s**5
@@ -185,8 +202,12 @@ def carry_along(workcell: Workcell, path: Array, duration: float) -> Carry:
 
 
 def _draw_cell(kind: str, rng: np.random.Generator) -> Workcell:
-    """Return a cell with a random payload of 3 to 15 kg, and hands of two arms at opposite sides or
-    edges of it."""
+    """Return a cell whose two arms hold a random payload of 3 to 15 kg at opposite sides or edges.
+
+    Args:
+        kind: kind of the hands.
+        rng: source of the random numbers.
+    """
     is_plate = kind == "fingers"
     lower, upper = ([0.3, 0.4, 0.004], [0.6, 0.8, 0.02]) if is_plate else ([0.3] * 3, [0.6] * 3)
     size = rng.uniform(lower, upper)

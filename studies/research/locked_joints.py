@@ -37,8 +37,10 @@ class LockedReplica:
 
 
 def locks(task: Task, count: int) -> tuple[tuple[float, ...], ...]:
-    """Return at least `count` combinations of positions of the redundant joints: the middles of the
-    cells of a grid over their bounds."""
+    """Return at least `count` combinations of positions of the redundant joints [rad or m].
+
+    The combinations are the middles of the cells of a grid over the joints' bounds.
+    """
     sides = max(ceil(count ** (1.0 / len(task.redundant)) - 1e-9), 1)
     shares = (np.arange(sides) + 0.5) / sides
     values = [
@@ -52,6 +54,16 @@ def compare(
     cell: Cell, count: int, replicas: int, evaluations: int, seed: int
 ) -> list[LockedReplica]:
     """Search with free and with locked redundant joints, in several replicas.
+
+    Args:
+        cell: the cell.
+        count: least number of combinations of locked positions.
+        replicas: number of replicas.
+        evaluations: budget of each search.
+        seed: seed of all searches.
+
+    Returns:
+        The hypervolumes of each replica.
 
     Raises:
         SettingsError: the cell has no redundant joint, or one is fixed at a waypoint.

@@ -122,7 +122,10 @@ class LoggedCarry:
 
 
 def labelled(folder: Path) -> list[Path]:
-    """Return the labelled runs' files, one per run.
+    """Return the paths of the logs with a label, one per run.
+
+    Args:
+        folder: folder of the downloaded data set.
 
     Raises:
         SettingsError: there are none.
@@ -189,8 +192,11 @@ def _arm(time: Array, force: Array, commanded: Array, poses: _Poses) -> _Arm:
 
 
 def _one_file(path: Path) -> list[_Arm]:
-    """Return both arms, along the axes of their bases; grasps and normals are in the world as
-    well."""
+    """Read a log that has both arms in one file; return the left arm, then the right.
+
+    The logged vectors are in each arm's base frame, grasps and normals also in the world. The
+    result is in the world frame.
+    """
     found = []
     with np.load(path) as log:
         time = log["t_epoch"] - log["t_epoch"][0]
@@ -213,8 +219,12 @@ def _one_file(path: Path) -> list[_Arm]:
 
 
 def _two_files(left: Path) -> list[_Arm]:
-    """Return both arms, along the axes of the world; turns along those of the bases, half a turn
-    apart."""
+    """Read a run whose arms have one log each; return the left arm, then the right, in the world
+    frame.
+
+    The logged vectors are along the world's axes. Logged rotations are in the bases, which are half
+    a turn apart.
+    """
     found, begin = [], 0.0
     for i, path in enumerate((left, left.with_stem(left.stem.removesuffix("_L") + "_R"))):
         with np.load(path) as log:

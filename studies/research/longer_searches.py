@@ -57,8 +57,19 @@ class LongerSearch:
 def controls(
     root: Path, evaluations: Sequence[int], jobs: int, progress: Progress
 ) -> list[LongerSearch]:
-    """Run longer searches of a polished study, in `ROOT/control/EVALUATIONS`, and compare; without
-    budgets, with that of equal time and `LONG_SEARCH`.
+    """Search a polished study's cell with larger budgets, and compare the fronts with the study's.
+
+    The results go to `ROOT/control/EVALUATIONS`.
+
+    Args:
+        root: results folder of the study.
+        evaluations: budgets of the longer searches. Empty for two budgets: one that takes as long
+            as the study's search and polish together, and `LONG_SEARCH`.
+        jobs: number of worker processes.
+        progress: receives messages on the progress.
+
+    Returns:
+        One comparison per budget, algorithm and rival.
 
     Raises:
         ResultsError: the study is not complete, or was not polished.
@@ -79,7 +90,15 @@ def controls(
 
 
 def _polish_cost(root: Path, summary: CampaignSummary) -> int:
-    """Return candidate evaluations that take as long as the most expensive polish of the study."""
+    """Return how many evaluations take as long as the most expensive polish of one replica.
+
+    Args:
+        root: results folder, for messages.
+        summary: summary of the study in this folder.
+
+    Raises:
+        ResultsError: the study was not polished.
+    """
     costs = [
         row.polished.equivalent_evaluations
         for entry in summary.algorithms.values()
@@ -150,7 +169,14 @@ class PolishGap:
 
 
 def approaches(root: Path, reference: ReferenceFront) -> list[PolishGap]:
-    """Compute the distances of a polished study's fronts to a reference front.
+    """Compare how far a study's fronts are from a reference front before and after the polish.
+
+    Args:
+        root: results folder of the polished study.
+        reference: the reference front of the same workcell.
+
+    Returns:
+        For each algorithm the medians over its replicas of the hypervolume gap and of IGD.
 
     Raises:
         ResultsError: the study is not complete, was not polished, or is of another workcell.

@@ -57,7 +57,15 @@ def shipped_problems() -> list[Path]:
 
 
 def attempt(path: Path, seed: int, seconds: float, evaluations: int) -> ProblemAttempt:
-    """Propose a carry for a problem, and recommend one if `evaluations` of a search are allowed."""
+    """Propose a carry for a problem file, then search for a recommended carry unless `evaluations`
+    is 0.
+
+    Args:
+        path: path of the problem file.
+        seed: seed of proposal and search.
+        seconds: time limit of the proposal [s].
+        evaluations: budget of the search.
+    """
     import numpy as np
 
     import hybrid_opt as ho

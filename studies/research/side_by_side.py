@@ -72,7 +72,14 @@ def _contents(cell: Cell) -> dict[str, Any]:
 
 
 def _candidates(cell: Cell, what: str, batches: int, rng: np.random.Generator) -> Array:
-    """Return candidates (batches, population, n_var) of a cell; `what` is 'near' or 'random'."""
+    """Draw decision vectors (batches, population, n_var) of a cell.
+
+    Args:
+        cell: the cell.
+        what: 'near' for candidates near the hand-made trajectory, 'random' for uniform ones.
+        batches: number of batches.
+        rng: source of the random numbers.
+    """
     size = (batches, POPULATION, cell.n_var)
     if what == "random":
         return rng.uniform(cell.lower, cell.upper, size)

@@ -166,8 +166,14 @@ def summary(found: Sequence[Slip]) -> str:
 def slip_of(
     name: str, candidate: str, carry: Carry, layer: float = SimulationSettings.layer
 ) -> Slip:
-    """Simulate one carry whose forces are planned, and see where it slips first; layer: stiffness
-    of the pads' layers [N/m^3]."""
+    """Simulate one carry with its planned forces, and find where the box slips first.
+
+    Args:
+        name: name of the cell.
+        candidate: kind of the candidate.
+        carry: the carry.
+        layer: stiffness of the pads' elastic layers [N/m^3].
+    """
     needed, settings = carry.normal_force[:, 1], SimulationSettings(layer=layer)
     if not carry.workcell.has_opposite_pads:
         settings = replace(settings, points=FINE_POINTS)
@@ -200,8 +206,15 @@ def slip_of(
 
 
 def first_slip(lacks: Outcome, held: Outcome) -> float:
-    """Find when a box that lacks force has moved farther in the plane of a pad than the same box
-    that is held by more, by `FARTHER` [s]; NaN where it has not."""
+    """Return the time [s] at which a box starts to slip; NaN if it does not.
+
+    This is when its displacement in the plane of a pad exceeds that of a well-held box by
+    `FARTHER`.
+
+    Args:
+        lacks: outcome of the simulation with too little force.
+        held: outcome of the simulation with enough force.
+    """
     n = min(len(lacks.time), len(held.time))
     beyond = np.flatnonzero((lacks.slip[:n] - held.slip[:n]).max(axis=1) > FARTHER)
     return float(lacks.time[beyond[0]]) if len(beyond) else float("nan")
@@ -227,7 +240,12 @@ class _Source:
         self._front: Array | None = None
 
     def case(self, k: int) -> tuple[str, str, Carry]:
-        """Return cell, candidate, and the carry with the forces planned for its friction."""
+        """Draw carry number k.
+
+        Returns:
+            Name of the cell, kind of the candidate, and the carry with its forces planned for the
+            friction of case k.
+        """
         cell, kind = self._cell, CANDIDATE_KINDS[k % len(CANDIDATE_KINDS)]
         model = cell.timing_model
         while True:

@@ -58,8 +58,15 @@ def interleaved(
 
 
 def _seconds(evaluate: Evaluate, x: Array, first: int, count: int) -> float:
-    """Return the time per call for `count` rows of x, from row `first` on, one after the other
-    [s]."""
+    """Measure the mean time per call [s] of a function at single decision vectors, one after the
+    other.
+
+    Args:
+        evaluate: function to call.
+        x: (n, n_var) decision vectors.
+        first: index of the first row; rows repeat after the last.
+        count: number of calls.
+    """
     start = time.thread_time()
     for k in range(first, first + count):
         evaluate(x[k % len(x)])
@@ -152,19 +159,21 @@ SHARE_BATCHES = 5
 def with_collisions(
     workcell: Workcell, plain: Evaluate, candidates: int, repeats: int, seed: int
 ) -> dict[str, Any]:
-    """Measure the evaluation with collisions; every time is in milliseconds per candidate.
+    """Measure three ways to evaluate candidates with collisions: compiled, interpreted and plain.
 
-    Figures are means over the rounds, as a search pays the mean and not the median.
+    Times are in milliseconds per candidate, means over the rounds, since a search pays the mean and
+    not the median.
 
     Args:
-        plain: the plain reference with collisions, of one decision vector.
-        candidates: batches of the compiled way, drawn from all candidates; the other ways
-            evaluate one candidate of each batch.
-        repeats: rounds with each of them.
-        seed: of the search and the draws.
+        workcell: the cell.
+        plain: function that evaluates one decision vector by the plain reference code.
+        candidates: number of batches for the compiled way; the other ways evaluate one candidate of
+            each batch.
+        repeats: number of rounds of each way.
+        seed: seed of the search and the draws.
 
     Returns:
-        The figures of the search's candidates and, as 'random', those of uniform candidates.
+        The figures of candidates from a search and, under the key 'random', of uniform candidates.
     """
     rng = np.random.default_rng(seed)
     progress(f"a search of {TURN_EVALUATIONS} evaluations, whose candidates are to be timed")

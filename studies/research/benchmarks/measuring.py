@@ -194,8 +194,16 @@ def measured(
     seed: int,
     study: bool,
 ) -> TaskResult:
-    """Propose a carry for one task, and search for the fastest and the shortest carry if `study`.
-    The problem file and the workcell file are written to the folder `output`."""
+    """Propose a carry for one task, and write the problem file and the workcell file.
+
+    Args:
+        benchmark: benchmark with the task.
+        task: the task.
+        output: folder for the files.
+        settings: settings of the proposal.
+        seed: seed of all searches.
+        study: True to search for the fastest and the shortest carry also.
+    """
     output.mkdir(parents=True, exist_ok=True)
     path = output / f"{benchmark.name}-{re.sub('[ /]', '-', task.name)}.toml"
     replace_file(path, completed("", {}, task.problem).encode())
@@ -226,9 +234,15 @@ def measured(
 
 
 def shortest_carry(workcell: Path, rng: np.random.Generator) -> ho.Carry:
-    """Return the carry of a cell with the shortest joint path that an evolution strategy finds
-    within the bounds, CMA-ES (Hansen, arXiv 1604.00772), started at the cell's initial trajectory.
-    The carry is certified free of collisions and keeps the cell's largest force."""
+    """Search for the carry with the shortest joint path by CMA-ES (Hansen, arXiv 1604.00772).
+
+    The search stays within the bounds of the free waypoints and starts at the cell's initial
+    trajectory. The carry is certified free of collisions and keeps the cell's largest force.
+
+    Args:
+        workcell: path of the workcell file.
+        rng: source of the random numbers.
+    """
     cell = ho.Cell.load(workcell, ("joint_length",))
     task = cell.workcell.task
     lower, width = task.lower, task.upper - task.lower
@@ -255,13 +269,25 @@ def _joints(carry: ho.Carry) -> tuple[Array, Array]:
 
 
 def length(benchmark: Benchmark, q: tuple[Array, Array]) -> Length:
-    """Return the length of the path of both arms' joints (n, joints)."""
+    """Return the length of a path in joint space and in the coordinates of the publication.
+
+    Args:
+        benchmark: benchmark that defines these coordinates.
+        q: joint positions (n, joints) of both arms along the path.
+    """
     return Length(path_length(np.hstack(q)), path_length(benchmark.coordinates(*q)))
 
 
 def checks_per_second(workcell: Path, rng: np.random.Generator) -> float:
-    """Return the number of random configurations of both arms that the collision check of a
-    proposal decides per second of working time, without compiled functions."""
+    """Measure how many random configurations of both arms the collision check of a proposal decides
+    per second of working time.
+
+    No compiled functions are used.
+
+    Args:
+        workcell: path of the workcell file.
+        rng: source of the configurations.
+    """
     cell = load(workcell)
     judge = judge_of(build_cell_bodies(cell))
     q_1, q_2 = (
@@ -293,8 +319,15 @@ BENCHMARK_FIGURES: tuple[tuple[str, Callable[[TaskResult], float | None], int], 
 
 
 def table(benchmark: Benchmark, found: list[TaskResult], rng: np.random.Generator) -> Table:
-    """Return the table of all results beside the published values. A note below states the number
-    of carries found, and the rate of collision checks in the first cell."""
+    """Return the table of all results of a benchmark beside the published values.
+
+    A note below states the number of carries found, and the rate of collision checks.
+
+    Args:
+        benchmark: the benchmark.
+        found: result of each task.
+        rng: source of the configurations for the rate of checks.
+    """
     rows = tuple(
         (one.task.name, *(number(figure(one), digits) for _, figure, digits in BENCHMARK_FIGURES))
         for one in found

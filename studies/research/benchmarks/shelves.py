@@ -128,11 +128,16 @@ def postures(notebook: bytes) -> dict[str, Array]:
 
 
 def coordinates(q_1: Array, q_2: Array) -> Array:
-    """Convert the joints (n, 7) of both arms to the eight published coordinates (n, 8), which
-    `postures` describes.
+    """Convert joint positions of both arms to the eight published coordinates of `postures`.
 
-    The elbow's turn is counted from the plane through the arm's first axis; it is meaningless if
+    The elbow's angle is counted from the plane through the arm's first axis; it is meaningless if
     the wrist lies on this axis.
+
+    Args:
+        q_1, q_2: (n, 7) joint positions of the arms [rad].
+
+    Returns:
+        (n, 8) coordinates.
     """
     return np.column_stack([q_1, np.unwrap([elbow_turn(q) for q in q_2])])
 
@@ -149,7 +154,10 @@ def elbow_turn(q: Array) -> float:
 
 
 def _box(model: pin.Model, q: Array) -> list[float]:
-    """Return the box pose for a posture of the left arm, whose last link points along y."""
+    """Return the box pose [m, rad] at which the left arm holds the box in joint positions q.
+
+    The last link must point along y.
+    """
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)
     hand = data.oMf[model.getFrameId("iiwa_link_7")]
@@ -181,8 +189,11 @@ def _robot(name: str, urdf: Path, folder: Path, y: float) -> dict[str, Any]:
 
 
 def _scene(models: Path) -> list[dict[str, Any]]:
-    """Return the table and the shelves as bodies of a workcell, with meshes in the folder
-    `models`."""
+    """Return the table and the shelves as the bodies of a workcell file, one dictionary each.
+
+    Args:
+        models: folder of the meshes.
+    """
     return [
         {**table, "xyz": (np.array(table["xyz"]) + at).tolist()}
         for name, at in STANDING.items()

@@ -24,8 +24,11 @@ from symbolic.robot.arm import (
 
 
 def held_model(robot: Robot) -> tuple[pin.Model, list[int], Array]:
-    """Return Pinocchio's model of a robot's whole description, the indices of the joints that do
-    not move, and their positions."""
+    """Build Pinocchio's model of a robot's whole description, and find the joints that do not move.
+
+    Returns:
+        The model, the indices of these joints, and the configuration (nq,) with their positions.
+    """
     urdf = read_urdf(robot.urdf, robot.xacro_arguments, robot.package_dirs)
     moving = moving_joints(urdf, robot.chain_root, robot.flange, robot.locked_joints)
     model = pin.buildModelFromXML(urdf.kinematics)
@@ -86,8 +89,14 @@ class PlainArm:
         return J
 
     def newton_step(self, q: Array, target: pin.SE3) -> Array:
-        """Return one Newton step (n,), shortened to `MAX_JOINT_STEP`; zero in a singular
-        posture."""
+        """Return the joint positions (n,) after one Newton step towards a flange pose.
+
+        The step is shortened to `MAX_JOINT_STEP`. In a singular posture the joints stay at q.
+
+        Args:
+            q: (n,) joint positions [rad or m].
+            target: pose of the flange to reach.
+        """
         here = self.place(q)
         turn = Rotation.from_matrix(target.rotation @ here.rotation.T).as_rotvec()
         angle = float(np.linalg.norm(turn))
@@ -105,8 +114,10 @@ class PlainArm:
         return moved
 
     def residual(self, q: Array, target: pin.SE3) -> float:
-        """Return the pose residual of joints q (n,): the norm of distance [m] and of twice the sine
-        of half the angle between placement and target."""
+        """Return the distance of the flange at joints q (n,) from a pose `target`.
+
+        This is the norm of the distance [m] and of twice the sine of half the angle.
+        """
         here = self.place(q)
         angle = Rotation.from_matrix(target.rotation @ here.rotation.T).magnitude()
         distance = np.linalg.norm(target.translation - here.translation)
@@ -141,8 +152,16 @@ class PlainArm:
         return min(q, other, key=lambda found: self.residual(found, target))
 
     def begin(self, start: Array, pose: Array, values: Array) -> Array:
-        """Return the start posture after an even motion of the redundant joints to their positions
-        at the first sample."""
+        """Return the posture (n,) at the first sample [rad or m].
+
+        The redundant joints move evenly from the start posture to their values, while the others
+        follow the box.
+
+        Args:
+            start: (n,) start posture [rad or m].
+            pose: (6,) pose of the box at the first sample [m, rad].
+            values: positions of the redundant joints at the first sample [rad or m].
+        """
         q, change = start.copy(), np.zeros(len(start))
         change[self.redundant] = (values - start[self.redundant]) / BEGIN_STEPS
         for _ in range(BEGIN_STEPS if self.redundant else 0):

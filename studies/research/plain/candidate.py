@@ -83,7 +83,12 @@ class PlainEvaluator:
         return PlainCandidate(outputs, names, next((each[0] for each in here if each), ""))
 
     def _constraints(self, outputs: dict[str, Array], k: int) -> list[float]:
-        """Return the values of all `CONSTRAINTS` at sample k."""
+        """Return the values of all `CONSTRAINTS` at sample k, in this order.
+
+        Args:
+            outputs: arrays of the motion and the loads by name, one row per sample.
+            k: index of the sample.
+        """
         workcell, values = self.workcell, {}
         friction = []
         for i, contact in enumerate(workcell.contacts):
@@ -116,7 +121,13 @@ def _violated(constraint: Array) -> list[list[str]]:
 
 
 def evaluate(workcell: Workcell, start: tuple[Array, Array], x: Array) -> PlainCandidate:
-    """Evaluate one decision vector (n_var,); see `PlainEvaluator`."""
+    """Evaluate one decision vector by `PlainEvaluator`.
+
+    Args:
+        workcell: the cell.
+        start: (n,) start posture of each arm [rad or m].
+        x: (n_var,) decision vector.
+    """
     return PlainEvaluator(workcell, start)(x)
 
 

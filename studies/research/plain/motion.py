@@ -22,8 +22,9 @@ full turn."""
 
 
 def waypoints(task: Task, x: Array) -> Array:
-    """Return all waypoints (n_waypoints, 6) of a decision vector, with unwrapped angles [m,
-    rad]."""
+    """Return all waypoints (n_waypoints, 6) [m, rad] of a decision vector x (n_var,), with
+    unwrapped angles.
+    """
     free = iter(np.reshape(x[: task.n_box], (-1, 6)))
     rows = np.array([w.lower if w.is_fixed else next(free) for w in task.waypoints])
     rows[:, 3:] = task.orientation.unwrapped(rows[:, 3:])
@@ -31,7 +32,9 @@ def waypoints(task: Task, x: Array) -> Array:
 
 
 def redundant_path(task: Task, x: Array) -> Array:
-    """Return the positions (samples, m) of the redundant joints of a decision vector."""
+    """Return the positions (samples, m) of the redundant joints for a decision vector x (n_var,)
+    [rad or m].
+    """
     free = iter(x[task.n_box :])
     columns = [
         [low if low == high else next(free) for low, high in zip(j.lower, j.upper, strict=True)]
@@ -79,8 +82,16 @@ def natural_quintic(points: Array) -> Array:
 
 
 def evaluate_spline(coefficients: Array, u: float, order: int = 0) -> Array:
-    """Return the derivative of an order of a spline, with respect to u in [0, 1] over the whole
-    spline."""
+    """Return a spline's value, or its derivative of a given order, at the parameter u.
+
+    Args:
+        coefficients: (segments, 6, n) coefficients of the quintic segments of equal length.
+        u: parameter in [0, 1] over the whole spline.
+        order: order of the derivative with respect to u.
+
+    Returns:
+        (n,) value or derivative.
+    """
     segments = len(coefficients)
     k = min(int(u * segments), segments - 1)
     value: Array = _powers(u * segments - k, order) @ coefficients[k] * segments**order
@@ -88,7 +99,7 @@ def evaluate_spline(coefficients: Array, u: float, order: int = 0) -> Array:
 
 
 def _powers(s: float, order: int) -> Array:
-    """Return the derivative of an order of (1, s, ..., s^5)."""
+    """Return the derivative of a given order of the powers (1, s, ..., s^5), as (6,)."""
     return np.array(
         [
             factorial(p) / factorial(p - order) * s ** (p - order) if p >= order else 0.0
@@ -104,8 +115,12 @@ def rotation(rpy: Array) -> Array:
 
 
 def box_rotation(orientation: Orientation, numbers: Array) -> Array:
-    """Compute R_world_box (3, 3) from the last three numbers of a pose, in the cell's
-    convention."""
+    """Compute R_world_box (3, 3) of a pose.
+
+    Args:
+        orientation: the cell's convention for orientations.
+        numbers: (3,) last three entries of the pose [rad].
+    """
     if not orientation.is_vector:
         return rotation(numbers)
     turn: Array = Rotation.from_rotvec(numbers).as_matrix()
@@ -120,10 +135,14 @@ def euler_axes(rpy: Array) -> tuple[Array, Array, Array]:
 
 
 def angular_rates(rpy: Array, rate: Array, second: Array) -> tuple[Array, Array]:
-    """Compute angular velocity and acceleration (3,) in the world frame from roll, pitch, yaw and
-    their derivatives.
+    """Compute angular velocity and acceleration, (3,) each, in the world frame from roll, pitch,
+    yaw.
 
     Each axis is rotated by the rotations outside it: d axis / dt = omega_outer x axis.
+
+    Args:
+        rpy: (3,) roll, pitch, yaw [rad].
+        rate, second: (3,) their first and second time derivative.
     """
     roll_axis, pitch_axis, yaw_axis = euler_axes(rpy)
     yaw_rate, pitch_rate, roll_rate = rate[2] * yaw_axis, rate[1] * pitch_axis, rate[0] * roll_axis
@@ -138,12 +157,16 @@ def angular_rates(rpy: Array, rate: Array, second: Array) -> tuple[Array, Array]
 
 
 def vector_rates(vector: Array, rate: Array, second: Array) -> tuple[Array, Array]:
-    """Compute angular velocity and acceleration (3,) in the world frame from a rotation vector and
-    its derivatives.
+    """Compute angular velocity and acceleration, (3,) each, in the world frame from a rotation
+    vector.
 
     omega is the integral of exp(s v) v' over s in [0, 1]; exp(s v) itself rotates with the same
     integral up to s (Chirikjian, Stochastic Models, Information Theory, and Lie Groups 2, 2012,
     10.7).
+
+    Args:
+        vector: (3,) rotation vector v [rad].
+        rate, second: (3,) its first and second time derivative.
     """
     nodes, weights = np.polynomial.legendre.leggauss(NODES)
     shares, weights = (nodes + 1.0) / 2.0, weights / 2.0
@@ -157,13 +180,26 @@ def vector_rates(vector: Array, rate: Array, second: Array) -> tuple[Array, Arra
 def box_rates(
     orientation: Orientation, numbers: Array, rate: Array, second: Array
 ) -> tuple[Array, Array]:
-    """Compute angular velocity and acceleration (3,) in the world frame from the last three numbers
-    of a pose and their derivatives, in the cell's convention."""
+    """Compute angular velocity and acceleration of the box, (3,) each, in the world frame.
+
+    Args:
+        orientation: the cell's convention for orientations.
+        numbers: (3,) last three entries of the pose [rad].
+        rate, second: (3,) their first and second time derivative.
+    """
     return (vector_rates if orientation.is_vector else angular_rates)(numbers, rate, second)
 
 
 def timed_motion(task: Task, x: Array) -> tuple[Array, Array, Array, Array]:
-    """Return time (n,) [s], pose, rate and second rate (n, 6) of a candidate."""
+    """Return the motion of a candidate over time.
+
+    Args:
+        task: task of the cell.
+        x: (n_var,) decision vector.
+
+    Returns:
+        Time (n,) [s]; pose, its first and its second time derivative, (n, 6) each.
+    """
     coefficients = natural_quintic(waypoints(task, x))
     u = np.linspace(0.0, 1.0, task.samples)
     pose = np.array([evaluate_spline(coefficients, value) for value in u])
@@ -217,8 +253,14 @@ def _ramped(
 
 
 def drive(task: Task, length: float, total: float) -> tuple[float, float, float]:
-    """Return time, speed and acceleration at which a motion from rest to rest, of the length
-    `total`, has covered `length`."""
+    """Compute time [s], speed [m/s] and acceleration [m/s^2] at a place of a motion from rest to
+    rest.
+
+    Args:
+        task: task with the reference speed and the time of the ramps.
+        length: length covered at this place [m].
+        total: length of the whole path [m].
+    """
     ramp, cruise = task.ramp_time, min(task.reference_speed, total / task.ramp_time)
     duration = ramp + total / cruise
     if length > total / 2.0:
@@ -236,7 +278,13 @@ PLAIN_GRAVITY = np.array([0.0, 0.0, -9.81])
 
 
 def sample_load(workcell: Workcell, pose: Array, rate: Array, second: Array) -> dict[str, Array]:
-    """Return all load quantities of one sample, by the names in `LOAD_OUTPUTS`."""
+    """Compute the loads on the contacts at one sample, by the names in `LOAD_OUTPUTS`.
+
+    Args:
+        workcell: the cell.
+        pose: (6,) pose of the box [m, rad].
+        rate, second: (6,) first and second time derivative of the pose.
+    """
     payload, contacts = workcell.payload, workcell.contacts
     orientation = workcell.task.orientation
     R = box_rotation(orientation, pose[3:])
@@ -278,8 +326,16 @@ def sample_load(workcell: Workcell, pose: Array, rate: Array, second: Array) -> 
 
 
 def allocate(f_n: float, f_t: float, friction: tuple[float, float]) -> tuple[Array, Array]:
-    """Return the least-effort normal forces (2,) and tangential shares (2,) for a resultant force
-    with normal component f_n and tangential magnitude f_t [N]."""
+    """Compute the normal and tangential forces of both pads with the least effort.
+
+    Args:
+        f_n: component of the required force along contact 1's normal [N].
+        f_t: magnitude of its tangential part [N].
+        friction: friction coefficient of each contact.
+
+    Returns:
+        Normal forces (2,) and tangential forces (2,) of the pads [N].
+    """
     if friction[0] == friction[1]:
         return _equal_friction(f_n, f_t, friction[0])
     return _small_program(f_n, f_t, friction)
@@ -294,8 +350,18 @@ def _equal_friction(f_n: float, f_t: float, mu: float) -> tuple[Array, Array]:
 
 
 def _small_program(f_n: float, f_t: float, friction: tuple[float, float]) -> tuple[Array, Array]:
-    """Solve the quadratic program in N_1, N_2, t_1, t_2 by trying all sets of active
-    constraints."""
+    """Solve the quadratic program of `allocate` for unequal friction.
+
+    The unknowns are N_1, N_2, t_1, t_2. All sets of active constraints are tried.
+
+    Args:
+        f_n: component of the required force along contact 1's normal [N].
+        f_t: magnitude of its tangential part [N].
+        friction: friction coefficient of each contact.
+
+    Returns:
+        Normal forces (2,) and tangential forces (2,) of the pads [N].
+    """
     equal = np.array([[1.0, -1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 1.0]])
     # Rows that must not be positive: both friction cones, both normal forces.
     bounds = np.array(
