@@ -17,8 +17,9 @@ MOST_VALUES = 1000
 
 
 def _over(text: str) -> tuple[str, tuple[float, ...]]:
-    """Parse a key of the workcell file and its values, from 'KEY=FIRST:LAST:STEP' with both ends
-    included, or from 'KEY=VALUE,VALUE'.
+    """Parse a key of the workcell file and the values that it takes in a sweep.
+
+    The form is 'KEY=FIRST:LAST:STEP' with both ends included, or 'KEY=VALUE,VALUE'.
 
     Raises:
         argparse.ArgumentTypeError: the text has another form, or more than `MOST_VALUES` values.

@@ -122,7 +122,7 @@ def interpolated(at: Array, along: Array, values: Array) -> Array:
 
 
 def evenly(count: int, most: int) -> NDArray[np.intp]:
-    """Return up to `most` of the indices 0 to `count` - 1, evenly spread, the first and the last
+    """Return at most `most` evenly spread indices from 0 to `count` - 1, the first and last
     included."""
     return np.linspace(0, count - 1, min(count, most)).round().astype(np.intp)
 

@@ -118,7 +118,7 @@ def candidate_function(model: CellModel) -> ca.Function:
 
 
 def _all(model: CellModel) -> dict[str, ca.MX]:
-    """Return MX vectors for all parameter groups that the evaluation of a candidate needs, by
+    """Return one MX column per parameter group that the evaluation of a candidate needs, by
     group."""
     workcell = model.workcell
     return mx_parameters(workcell.task, *workcell.robots, model, workcell.payload)
@@ -313,7 +313,14 @@ def _forces_function(
     load: dict[str, ca.MX],
     handed: dict[str, ca.MX],
 ) -> ca.Function:
-    """Build the function `forces` that `sample_functions` describes."""
+    """Build the function `forces` that `sample_functions` describes.
+
+    Args:
+        model: model of the cell.
+        motion: symbols of the box's motion at one sample; the first is the pose.
+        load: expressions of the loads on the contacts, by name.
+        handed: symbolic parameters of the cell, by group.
+    """
     workcell = model.workcell
     joints = [ca.MX.sym(f"q_{i + 1}", model.robots[i].n_joints) for i in (0, 1)]
     outputs = dict(load)

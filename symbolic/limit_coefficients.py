@@ -150,7 +150,7 @@ def sample_limits_function(model: CellModel) -> ca.Function:
 
 def limit_numbers(workcell: Workcell) -> dict[str, ca.SX]:
     """Return the symbolic parameters that `sample_limits_function` takes after its other inputs, by
-    name of their group."""
+    group."""
     return sx_parameters(workcell.task, *workcell.robots, workcell.payload)
 
 
@@ -333,8 +333,8 @@ def contact_limits(
 
 
 def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
-    """Build the two functions of `ratio_functions` for a cell in which a convex program computes
-    the forces."""
+    """Build the functions `limit_ratios` and `limit_slopes` for cells whose forces need a convex
+    program."""
     layout = limit_layout(workcell)
     sizes, joints = layout.sizes, layout.joints
     names = ("force", "moment", "torque", "wrench")
@@ -371,8 +371,12 @@ def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
 
 
 def _inputs(workcell: Workcell, blocks: dict[str, ca.SX]) -> dict[str, ca.SX]:
-    """Return the inputs of the function `limit_forces` by name; `blocks` are the symbols of one
-    sample's blocks."""
+    """Return the inputs of the function `limit_forces`, as symbols by name.
+
+    Args:
+        workcell: the cell.
+        blocks: symbols of the blocks of one sample's limits.
+    """
     timing = {name: ca.SX.sym(name) for name in ("a", "w")}
     return {"sample": ca.vertcat(*blocks.values())} | timing | sx_parameters(workcell.payload)
 
@@ -380,8 +384,14 @@ def _inputs(workcell: Workcell, blocks: dict[str, ca.SX]) -> dict[str, ca.SX]:
 def _slopes(
     name: str, value: ca.SX, inputs: dict[str, ca.SX], implicit: ImplicitVariables
 ) -> ca.Function:
-    """Build the function of an expression `value` and its derivatives by u'' and u'^2; its inputs
-    are `inputs`, then the solved variables of `implicit`."""
+    """Build the function of an expression and its derivatives by a = u'' and w = u'^2.
+
+    Args:
+        name: name of the function.
+        value: the expression.
+        inputs: inputs of the function by name; `a` and `w` are among them.
+        implicit: variables that an equation determines; they are the last input, `solved`.
+    """
     value = ca.densify(value)
     by = {f"by_{z}": ca.densify(ca.jacobian(value, inputs[z])) for z in ("a", "w")}
     return named_function(name, inputs | {"solved": implicit.symbols}, {"value": value} | by)

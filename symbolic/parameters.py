@@ -360,8 +360,13 @@ def _grasp(
 
 
 def _as(kind: Any, record: Any, **changes: Any) -> Any:
-    """Return a record of the class `kind` with the fields of `record`, except those in
-    `changes`."""
+    """Return a record of another class with the same fields.
+
+    Args:
+        kind: the class.
+        record: record that gives the fields.
+        changes: fields with other values.
+    """
     known = {each.name: getattr(record, each.name) for each in fields(record)}
     return kind(**(known | changes))
 
@@ -397,8 +402,16 @@ def _split(T: Array) -> tuple[Array, Array]:
 
 
 def _turn(take: _Take, group: str, path: str, rotation: Array) -> Any:
-    """Return the rotation of a robot's base in which `take` has replaced the parameters: cosine and
-    sine of one angle for an upright base, the whole matrix (3, 3) for a tilted base."""
+    """Return the rotation of a robot's base with its parameters replaced by symbols.
+
+    These are cosine and sine of one angle for an upright base, all entries for a tilted base.
+
+    Args:
+        take: function that replaces a value of a group by symbols.
+        group: parameter group.
+        path: key path of the robot.
+        rotation: (3, 3) rotation of the base.
+    """
     level = np.array([0.0, 0.0, 1.0])
     if np.array_equal(rotation[2], level) and np.array_equal(rotation[:, 2], level):
         cosine, sine = rotation[0, 0], rotation[1, 0]
@@ -516,7 +529,13 @@ def _body(take: _Take, path: str, body: ScreenBody) -> Any:
 
 
 def _own(take: _Take, path: str, value: Any) -> Any:
-    """Return a record in which `take` has replaced every array, in the order of the fields."""
+    """Return a record with every array replaced by symbols, in the order of the fields.
+
+    Args:
+        take: function that replaces a value of a group by symbols.
+        path: key path of the record.
+        value: the record, or a tuple or array in it.
+    """
     if isinstance(value, np.ndarray) and value.size:
         return take(BODIES, path, value)
     if isinstance(value, tuple):

@@ -78,7 +78,7 @@ class ReportRun:
 
     @property
     def fronts(self) -> tuple[Front, ...]:
-        """The front of the search; then the polished front, if there is one with points."""
+        """The front of the search, then the polished front if it has points."""
         return (self.front, *([self.hybrid] if self.hybrid else []))
 
 
@@ -313,11 +313,12 @@ def gather(
 
 
 def gather_carries(root: Path) -> tuple[CellGeometry, tuple[DrawnCarry, ...]]:
-    """Return the geometry of a study's cell and its carries: the hand-made one, then the selected
-    one of each algorithm that has one.
+    """Return the geometry of a study's cell and the carries to draw.
+
+    The carries are the hand-made one, then the selected one of each algorithm that has one.
 
     Args:
-        root: the results folder.
+        root: results folder of the study.
 
     Raises:
         ResultsError: the folder is not complete or damaged.

@@ -210,8 +210,8 @@ def panel_label(axes: Axes, letter: str, text: str, bare: bool = False) -> None:
 
 
 def files_of(figure: Figure, pdf: bool = True) -> dict[str, bytes]:
-    """Return the contents of the files of a figure with fixed layout by suffix: 'png', and 'pdf' if
-    wanted."""
+    """Return the contents of the files of a figure with fixed layout, by suffix: 'png', and 'pdf'
+    if `pdf`."""
     wanted = {"png": {"Software": None}} | ({"pdf": {"CreationDate": None}} if pdf else {})
     files = {}
     with in_style():
@@ -352,7 +352,12 @@ class Faces:
 
 @dataclass(frozen=True)
 class CutCell:
-    """The geometry of a cell, and its drawn solids as small triangles."""
+    """A cell whose solids are cut into small triangles, so that they can be sorted by depth.
+
+    Attributes:
+        geometry: geometry of the cell.
+        faces: triangles of each drawn solid.
+    """
 
     geometry: CellGeometry
     faces: tuple[Faces, ...]
@@ -426,6 +431,9 @@ def draw_cell(
     """Draw the cell at one sample of a motion.
 
     Args:
+        axes: axes to draw into.
+        cell: the cell, cut into triangles.
+        view: direction from which the cell is seen.
         pose: (6,) pose of the box [m, rad].
         q: (joints,) joint positions of both arms side by side [rad or m].
         hidden: kinds of frames whose solids are left out.
@@ -475,7 +483,14 @@ def _polygons(flat: Array, **style: Any) -> PolyCollection:
 
 
 def draw_path(axes: Axes, view: View, points: Array, **style: object) -> None:
-    """Draw a line through points (n, 3) of the world, in front of all bodies."""
+    """Draw a line through points (n, 3) of the world [m], in front of all bodies.
+
+    Args:
+        axes: axes to draw into.
+        view: direction from which the points are seen.
+        points: (n, 3) points.
+        style: keyword arguments of Matplotlib for the line.
+    """
     flat = view.flat(points)
     axes.plot(flat[:, 0], flat[:, 1], zorder=4.0, **style)  # type: ignore[arg-type]
 
@@ -484,7 +499,10 @@ def draw_box_edges(axes: Axes, view: View, lower: Array, upper: Array, **style: 
     """Draw the twelve edges of a box along the world's axes.
 
     Args:
+        axes: axes to draw into.
+        view: direction from which the box is seen.
         lower, upper: (3,) corners with the least and largest coordinates [m].
+        style: keyword arguments of Matplotlib for the lines.
     """
     flat = view.flat(box_corners(lower, upper))
     # Corners whose numbers differ in one bit are neighbours.
@@ -524,12 +542,15 @@ def _negated(value: float, _: object) -> str:
 
 
 def aspect(view: View, points: Array) -> float:
-    """Return the width over the height of points (n, 3) of the world as seen in a view."""
+    """Return width over height of the picture of points (n, 3) of the world in a view."""
     width, height = np.ptp(view.flat(points), axis=0)
     return float(width / height)
 
 
 def box_corners(lower: Array, upper: Array) -> Array:
-    """Return the 8 corners (8, 3) of a box along the axes, from its least and its largest corner
-    (3,)."""
+    """Return the 8 corners (8, 3) of a box along the axes [m].
+
+    Args:
+        lower, upper: (3,) corners with the least and largest coordinates [m].
+    """
     return np.array(list(product(*zip(lower, upper, strict=True))))

@@ -219,10 +219,11 @@ experiment."""
 
 
 def report_tables(data: ReportData, with_paper: bool) -> tuple[Table, ...]:
-    """Return all tables of a report: those of `study_tables`, and those of the timings, the phases
-    of the jobs and the margins.
+    """Return all tables of a report: `study_tables`, and the tables of timings, job phases and
+    margins.
 
     Args:
+        data: what the report shows.
         with_paper: True to add rows with the paper's values.
     """
     beside = None if data.drivable is None or data.alone else data.drivable.summary

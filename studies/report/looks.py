@@ -122,7 +122,12 @@ def write_animation(geometry: CellGeometry, film: Film, path: Path) -> None:
 
 
 def frames(geometry: CellGeometry, film: Film) -> Iterator[NDArray[np.uint8]]:
-    """Yield the pictures (height, width, 3) of an animation, evenly spaced in time."""
+    """Yield the pictures (height, width, 3) of an animation, evenly spaced in time.
+
+    Args:
+        geometry: geometry of the cell.
+        film: motion, view and size of the animation.
+    """
     cell = CutCell.of(geometry, cell_solids(geometry))
     points = motion_points(geometry, film.pose, film.q)
     count = max(2, round(film.duration * FRAMES_PER_SECOND) + 1)

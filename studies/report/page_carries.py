@@ -318,7 +318,7 @@ def _phase(phase: Phase) -> dict[str, Any]:
 
 
 def _rounded(values: Array, digits: int) -> list[float | None]:
-    """Round values to `digits` decimals for JSON; NaN becomes None."""
+    """Round values (n,) to `digits` decimals, as a list for JSON in which None stands for NaN."""
     return [None if np.isnan(value) else round(value, digits) for value in values.tolist()]
 
 
@@ -432,12 +432,17 @@ def _motion(name: str, carry: ho.Carry, commanded: Array | None = None) -> dict[
 def _uses(
     workcell: Workcell, whole: Array, contact: Sequence[Array]
 ) -> dict[str, list[float | None]]:
-    """Return the largest use of each joint's torque limit [%]: `torqueUse` for all loads,
-    `contactTorqueUse` for the contact wrenches alone. None for joints without a limit.
+    """Return how much of its torque limit each joint uses at most [%]; None for joints without a
+    limit.
 
     Args:
+        workcell: the cell.
         whole: (n, joints) torques of all loads [N m].
         contact: arrays (n, joints) of torques of the contact wrenches, one per phase [N m].
+
+    Returns:
+        Lists with one entry per joint: `torqueUse` for all loads, `contactTorqueUse` for the
+            contact wrenches alone.
     """
     torques = {"torqueUse": whole, "contactTorqueUse": np.concatenate(contact)}
     return {name: _rounded(joint_torque_use(workcell, each), 3) for name, each in torques.items()}

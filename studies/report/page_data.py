@@ -114,13 +114,25 @@ def cloud(label: str, at: Array, look: LineStyle) -> Plot:
 
 
 def line(label: str, at: Array, colour: str, dash: str) -> Plot:
-    """Return a plotly trace of a line through points (k, 2)."""
+    """Return a plotly trace of a line.
+
+    Args:
+        label: name in the legend.
+        at: (k, 2) points of the line.
+        colour: CSS colour.
+        dash: plotly's name of the line's pattern.
+    """
     style = {"color": colour, "dash": dash, "width": 1.6}
     return _scatter(label, at, mode="lines", hoverinfo="skip", line=style)
 
 
 def mark(label: str, at: Array) -> Plot:
-    """Return a plotly trace of one named point (2,)."""
+    """Return a plotly trace of one marked point.
+
+    Args:
+        label: name in the legend.
+        at: (2,) point.
+    """
     look = {"color": "#1d2327", "size": 11, "symbol": "x-thin", "line": {"width": 2.5}}
     return _scatter(label, at[None], mode="markers", hoverinfo="name", marker=look)
 
@@ -159,7 +171,13 @@ def front_plot(name: str, titles: tuple[str, str], traces: list[Plot], first: Ar
 
 
 def _legend(edge: str, place: float, size: int) -> Plot:
-    """Return a plotly legend in one row along the 'top' or 'bottom' edge of the plot's element."""
+    """Return a plotly legend in one row.
+
+    Args:
+        edge: edge of the row that lies at `place`, 'top' or 'bottom'.
+        place: height in the plot's element, from 0 at the bottom to 1.
+        size: size of the font [px].
+    """
     row = {"orientation": "h", "yref": "container", "y": place, "yanchor": edge}
     return {**row, "font": {"size": size}}
 
@@ -446,8 +464,16 @@ def _drive_view(
     groups: Sequence[Numbered],
     found: Sequence[dict[str, Any]],
 ) -> Plot:
-    """Return the plotly plot of duration against commanded force as robots drive the carries:
-    hand-made path, fronts, recommended carry and allowed force."""
+    """Return the plotly plot of duration against commanded force of carries as robots drive them.
+
+    The plot shows the hand-made path, the fronts, the recommended carry and the allowed force.
+
+    Args:
+        data: what the report shows.
+        drivable: the drivable experiment.
+        groups: groups of trajectories with their numbers.
+        found: trajectories of the page as JSON values, by number.
+    """
     allowed = float(drivable.workcell.task.reference_force[1 - LEADER])
     # The recommended carry is drawn last, above all others.
     shown = sorted(_traces(groups, found), key=lambda trace: trace["name"] == RECOMMENDED_TITLE)
@@ -479,7 +505,13 @@ def _allowed(force: float) -> Plot:
 def _search_view(
     data: ReportData, groups: Sequence[Numbered], found: Sequence[dict[str, Any]]
 ) -> Plot:
-    """Return the plot of the first experiment's fronts."""
+    """Return the plotly plot of the fronts of a study's first experiment.
+
+    Args:
+        data: what the report shows.
+        groups: groups of trajectories with their numbers.
+        found: trajectories of the page as JSON values, by number.
+    """
     titles = [*data.objective_titles, "", ""]
     judged = [carry.timed.judgement for carry in data.carries]
     selected = np.array([list(one.objectives.values()) for one in judged if one is not None])

@@ -86,8 +86,14 @@ class ReachMap:
 
 
 def reach_map(geometry: CellGeometry, rng: np.random.Generator) -> ReachMap:
-    """Compute the cubes that each pad reaches in random postures within the joint limits. Holes of
-    a few cubes, which random postures miss, are filled."""
+    """Compute the cubes of a grid that each pad reaches in random postures within the joint limits.
+
+    Holes of a few cubes, which random postures miss, are filled.
+
+    Args:
+        geometry: geometry of the cell.
+        rng: source of the postures.
+    """
     clouds = [_pad_points(geometry, i, rng) for i in (0, 1)]
     both = np.concatenate(clouds)
     lower = np.floor(both.min(axis=0) / CUBE_EDGE - 3.0) * CUBE_EDGE
@@ -138,7 +144,7 @@ def _pad_points(geometry: CellGeometry, i: int, rng: np.random.Generator) -> NDA
 
 
 def _seen(T: Array, points: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Transform points (3, n) by the homogeneous transform T (4, 4)."""
+    """Transform points (3, n) by a homogeneous transform T (4, 4); return points (3, n)."""
     placed = T.astype(np.float32)
     return np.asarray(placed[:3, :3] @ points + placed[:3, 3:])
 
@@ -347,10 +353,14 @@ def _reach_bounds(reach: ReachMap) -> Array:
 
 
 def _draw_reach(axes: Axes, reach: ReachMap, view: View, across: int, at: float) -> None:
-    """Draw a slice through the regions that the pads and the box centre reach. In slices across y
-    only the common region is drawn, because the pads' regions would hide it.
+    """Draw a slice through the regions that the pads and the box centre reach.
+
+    In slices across y only the common region is drawn, because the pads' regions would hide it.
 
     Args:
+        axes: axes to draw into.
+        reach: grid with the regions.
+        view: direction from which the slice is seen.
         across: index of the world axis that is perpendicular to the slice.
         at: coordinate of the slice on this axis [m].
     """
@@ -375,10 +385,13 @@ def _draw_slice(
     """Fill one slice of a region.
 
     Args:
+        axes: axes to draw into.
+        view: direction from which the slice is seen.
         reach: the grid.
         across: index of the world axis that is perpendicular to the slice.
         index: index of the slice's cubes along this axis.
         region: boolean array (nx, ny, nz), True in the region.
+        colour, hatch, alpha: colour, pattern and opacity of the slice.
     """
     mask = np.take(region, index, axis=across)
     if not mask.any():
@@ -446,6 +459,8 @@ def meeting_place(
     """Compute the middle of the region in which the bounding boxes of two bodies intersect.
 
     Args:
+        geometry: geometry of the cell.
+        solids: solids of the cell, among them those of the bodies.
         pair: names of the bodies.
         pose: (6,) pose of the box [m, rad].
         q: (joints,) joint positions of both arms [rad].

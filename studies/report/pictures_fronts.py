@@ -192,9 +192,16 @@ def _zoom(axes: Axes, data: ReportData, sets: Sequence[Array]) -> None:
 
 
 def duration_against_force(data: ReportData, choice: StoredRecommendation) -> Figure:
-    """Draw the shortest drivable durations with at most a commanded force, held in every case of
-    the uncertainty: single paths, and all paths that the recommended carry was chosen from. Limits
-    on jerk hold only for the star."""
+    """Draw the shortest drivable durations with at most a commanded force, for all cases of the
+    uncertainty.
+
+    One curve is drawn per single path, and one for all paths that the recommended carry was chosen
+    from. Limits on jerk hold only for the star.
+
+    Args:
+        data: what the report shows.
+        choice: the recommendation with its curves.
+    """
     figure = new_figure(0.5)
     axes = figure.subplots()
     force, looks = np.array(choice.durations.forces), {RECOMMENDED_LABEL: RECOMMENDED_STYLE}

@@ -110,9 +110,10 @@ def newtons(force: float) -> str:
 
 
 def answer(found: StoredRecommendation, folder: str) -> StudyAnswer:
-    """Convert a stored recommendation to the answer of a study in words.
+    """Describe a stored recommendation in words, as the answer of a study.
 
     Args:
+        found: the stored recommendation.
         folder: path of the results, put in front of the files' names; '' if it is the working
             folder.
     """
@@ -245,9 +246,11 @@ def _percent(ratio: float) -> str:
 
 
 def _margins(found: StoredRecommendation) -> list[str]:
-    """Return phrases on how far single values may be off before the commanded force is too small:
-    the part of this force that may be missing, and the error of the centre of mass along each
-    axis."""
+    """Return phrases on the errors at which the commanded force becomes too small.
+
+    These are the part of this force that may be missing, and the error of the centre of mass along
+    each axis.
+    """
     texts = [
         f"up to {100.0 * margin.limit:.0f} % of it may be missing"
         for margin in found.margins

@@ -236,16 +236,19 @@ def recommend_from(
     target: str = EXPORT_TARGET,
     threads: int = 0,
 ) -> StoredRecommendation:
-    """Choose a carry from the drivable fronts of a study and write its trajectory file. Return the
-    recommendation.
+    """Choose a carry from the drivable fronts of a study and write its trajectory file.
 
     Args:
         root: results folder of the study, whose drivable experiment is finished.
         wish: what the carry should be best at.
         path: path of the trajectory file.
+        progress: receives messages on the progress.
         target: name of the export's target, stored in the recommendation.
         threads: number of threads that time carries, 0 for one per core; it has no influence on the
             result.
+
+    Returns:
+        The recommendation.
 
     Raises:
         NoCarryError: no drivable carry was found; the message says why.

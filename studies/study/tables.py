@@ -188,6 +188,8 @@ def _table(
     """Build a table with one row per record.
 
     Args:
+        name: name of the table's file, without suffix.
+        heading: sentence above the table.
         columns: function that makes the text of a cell from a record, by the heading of the column.
         of: the records.
         note: text below the table.

@@ -78,7 +78,7 @@ class ConvexProgram(Protocol):
 
     @property
     def cell_sizes(self) -> tuple[tuple[str, int], ...]:
-        """Name and number of entries of each input of the program."""
+        """(name, number of entries) of each input of the program."""
 
     @property
     def given(self) -> dict[str, ca.SX]:
@@ -86,21 +86,21 @@ class ConvexProgram(Protocol):
         group. Compiled functions take these parameters after the inputs `cell_sizes`."""
 
     def free(self, wrenches: list[ca.SX]) -> ca.SX:
-        """Select the free components from the scaled wrenches of all contacts, as one column. The
-        load and the free components determine the other components."""
+        """Select the free components of the scaled wrenches of all contacts, as one column. The
+        load and the free components determine the others."""
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
-        """Compute the scaled wrenches of all contacts that balance the load in `cell`. The result
-        is affine in the free components `free`."""
+        """Compute the scaled wrench of each contact from the column `free` of free components, in
+        balance with the load in the inputs `cell`. The result is affine in `free`."""
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
-        """Compute the cost of scaled wrenches, a scalar: the sum over the contacts of convex terms
-        of degree two at most."""
+        """Compute the cost of the scaled wrenches of all contacts: a scalar, the sum over the
+        contacts of convex terms of degree two at most. `cell` lists the program's inputs."""
 
     def start(self, cell: list[ca.SX]) -> tuple[list[ca.SX], ca.SX]:
-        """Return the start of the method for the inputs `cell`: the state of each patch, within its
-        cone and in balance with the load; and the barriers' weight times the sum of the patches'
-        degrees, over the effort."""
+        """Return the start of the method for the inputs `cell`: the state (n,) of each patch,
+        within its cone and in balance with the load; and a scalar: weight of the barriers times the
+        sum of the patches' degrees, over the effort."""
 
     def __hash__(self) -> int:
         """Hash by identity: compiled functions are cached by program."""
@@ -127,8 +127,8 @@ class Patch(ABC):
 
     @abstractmethod
     def centred(self, state: ca.SX, weight: ca.SX) -> ca.SX:
-        """Return the iterate (iterate_size,) of a state (n,), with the multipliers for which X S
-        equals the barrier's weight `weight`."""
+        """Return the iterate (iterate_size,) of a state (n,): the state, and the multipliers for
+        which X S equals the barrier's weight `weight`."""
 
     @abstractmethod
     def local(self, iterate: ca.SX) -> LocalPatch:
@@ -142,9 +142,8 @@ class Patch(ABC):
 
     @abstractmethod
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
-        """Compute a negative number -1 / t, where t is a step length for which `state` + t `change`
-        (n,) still lies within the cone. It bounds the relative changes of the eigenvalues of X from
-        below."""
+        """Compute a number -1 / t < 0 with which `state` + t `change`, both (n,), still lies within
+        the cone. It bounds the relative changes of the eigenvalues of X from below."""
 
     @abstractmethod
     def slack(self, state: ca.SX) -> ca.SX:
@@ -160,7 +159,7 @@ class Patch(ABC):
 
     def third(self, state: ca.SX, along: ca.SX, columns: ca.SX) -> ca.SX:
         """Compute the third derivative (n, k) of the barrier at a state (n,): the change of its
-        Hessian along the direction `along` (n,), times `columns` (n, k)."""
+        Hessian along the direction `along` (n,), times the matrix `columns` (n, k)."""
         sizes = (1, 1, columns.shape[1])
         symbol, one, others = symbols = [ca.SX.sym("s", self.state_size, k) for k in sizes]
         slope = ca.gradient(self.potential(symbol), symbol)
@@ -202,12 +201,13 @@ class LocalPatch(Protocol):
     gap: ca.SX
 
     def pull(self, weight: ca.SX, correction: ca.SX) -> ca.SX:
-        """Compute the multipliers (n,) after a Newton step to a weight of the barrier that leaves
-        the state unchanged, with a second-order correction (correction_size,)."""
+        """Compute the multipliers (n,) after a Newton step that leaves the state unchanged.
+        `weight` is the barrier's new weight, `correction` (correction_size,) the second-order
+        correction."""
 
     def step(self, weight: ca.SX, correction: ca.SX, change: ca.SX) -> NewtonStep:
-        """Compute the Newton step to a weight of the barrier with a second-order correction
-        (correction_size,), from the change (n,) of the state in this step."""
+        """Compute the Newton step in which the state changes by `change` (n,). `weight` is the
+        barrier's new weight, `correction` (correction_size,) the second-order correction."""
 
 
 # --- the method ---
@@ -236,8 +236,8 @@ def least_effort(program: ConvexProgram, *cell: ca.MX, differentiable: bool = Fa
 def central_path(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     """Build the function that solves a program by the interior-point method.
 
-    The program's inputs and symbolic parameters map to the iterates of all patches, one after the
-    other. They lie near the central path at a weight of `final_weight` times the effort.
+    It maps the program's inputs and symbolic parameters to one column, the iterates of all patches,
+    near the central path at a weight of `final_weight` times the effort.
     """
     cell = _mx_inputs(program)
     step = _step(program, final_weight)
@@ -249,8 +249,8 @@ def central_path(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> 
 def centred(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     """Build the function that solves a program and moves the solution onto the central path.
 
-    The program's inputs and symbolic parameters map to the states of all patches, one after the
-    other, at a weight of `final_weight` times the effort. CasADi takes its derivatives as zero.
+    It maps the program's inputs and symbolic parameters to one column, the states of all patches,
+    at a weight of `final_weight` times the effort. CasADi takes its derivatives as zero.
     """
     cell = _mx_inputs(program)
     owns = ca.vertsplit(central_path(program, final_weight)(*cell), ends_of(program))
@@ -264,10 +264,9 @@ def centred(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Fu
 def _repeated(
     program: ConvexProgram, step: ca.Function, most: int, iterate: ca.MX, cell: list[ca.MX]
 ) -> ca.MX:
-    """Build the expression of an iterate after repeated steps.
-
-    The step is repeated in blocks of `BLOCK`, at most `most` times, until its flag is 0.
-    """
+    """Build the expression of an iterate after repeated steps: the function `step` is applied to
+    `iterate` in blocks of `BLOCK`, at most `most` times, until its flag is 0. `cell` has the inputs
+    and symbolic parameters of the program."""
     held = [ca.MX.sym("iterate", iterate.shape[0]), ca.MX.sym("goes_on")]
     inputs = [*held, *_mx_inputs(program)]
     keep = ca.Function("keep", inputs, held)
@@ -285,8 +284,12 @@ def _repeated(
 
 @lru_cache(PROGRAMS)
 def _step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
-    """Build the function of one step of the method: iterate, unused flag and inputs to the next
-    iterate, and a flag that is 1 if a further step is needed."""
+    """Build the function of one step of the interior-point method.
+
+    Its inputs are an iterate, an unused flag and the program's inputs. Its outputs are the next
+    iterate, and a flag that is 1 if a further step is needed. The method ends at the weight
+    `final_weight` over the effort.
+    """
     iterate, cell = ca.SX.sym("iterate", ends_of(program)[-1]), _sx_inputs(program)
     owns = zip(program.patches, ca.vertsplit(iterate, ends_of(program)), strict=True)
     local = [patch.local(own) for patch, own in owns]
@@ -322,9 +325,10 @@ def _step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Func
 def barrier_step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     """Build the function of one Newton step of all patches' states towards the central path.
 
-    Inputs: states, an unused flag, the program's inputs and symbolic parameters. Outputs: new
-    states, and a flag that is 1 if a further step is needed. On the central path, the derivatives
-    by the inputs are those of the path. The weight is `final_weight` times the effort.
+    Its inputs are the states, an unused flag, and the program's inputs and symbolic parameters. Its
+    outputs are the new states, and a flag that is 1 if a further step is needed. On the central
+    path, the derivatives by the inputs are those of the path. The weight is `final_weight` times
+    the effort.
     """
     states, cell = ca.SX.sym("states", state_ends(program)[-1]), _sx_inputs(program)
     owns = ca.vertsplit(states, state_ends(program))
@@ -341,11 +345,11 @@ def barrier_step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> 
 def barrier_equations(
     program: ConvexProgram, states: list[ca.SX], cell: list[ca.SX], final_weight: float
 ) -> tuple[ca.SX, list[ca.SX], Equations]:
-    """Build Newton's equations of the effort plus the barriers, at one state per patch.
+    """Build Newton's equations of the effort plus the barriers, at the state (n,) of each patch.
 
     Returns:
-        The weight, `final_weight` times the effort; for each patch the multipliers, -weight times
-        the barrier's gradient; and Newton's equations.
+        The weight, `final_weight` times the effort; for each patch the multipliers (n,), -weight
+        times the barrier's gradient; and Newton's equations.
     """
     weight = final_weight * program.effort(wrenches_of(program, states), cell)
     patches = zip(program.patches, states, strict=True)
@@ -382,8 +386,8 @@ def central_point(
 
 
 def _length(lowest: list[ca.SX], share: ca.SX | float) -> ca.SX:
-    """Compute the length of a step, at most 1, that goes at most the share `share` of the way to
-    the boundary of any cone; `lowest` has -1 / t of each patch (`Patch.lowest`)."""
+    """Compute the length of a Newton step, at most 1, that goes at most `share` of the way to any
+    cone's boundary. `lowest` is -1 / t of each patch, with t the length to its boundary."""
     return ca.fmin(1.0, share / ca.fmax(-minimum(lowest), share))
 
 
@@ -508,7 +512,7 @@ class Equations:
 
     def decrement(self, pulls: list[ca.SX], changes: list[ca.SX]) -> ca.SX:
         """Compute the squared Newton decrement times the weight of the barriers, from the
-        multipliers and the state's change of each patch, (m,) each."""
+        multipliers `pulls` (m,) and the change `changes` (m,) of the state of each patch."""
         return ca.dot(ca.vertcat(*pulls) - self.slope, ca.vertcat(*changes))
 
     def changes(self, pulls: list[ca.SX]) -> list[ca.SX]:
@@ -544,8 +548,8 @@ class Equations:
 def effort_derivatives(
     program: ConvexProgram, states: list[ca.SX], cell: list[ca.SX]
 ) -> list[ca.SX]:
-    """Compute the effort (scalar) at given states of the patches, its gradient (n,) and its Hessian
-    (n, n) by the n entries of all states."""
+    """Compute effort (scalar), gradient (n,) and Hessian (n, n) by the n entries of all states.
+    `states` has the state of each patch, `cell` the program's inputs."""
     symbols = [ca.SX.sym("state", state.shape[0]) for state in states]
     effort, whole = program.effort(wrenches_of(program, symbols), cell), ca.vertcat(*symbols)
     by = [effort, *ca.hessian(effort, whole)[::-1]]
@@ -554,19 +558,18 @@ def effort_derivatives(
 
 
 def _mx_inputs(program: ConvexProgram) -> list[ca.MX]:
-    """Return MX symbols for the program's inputs and the symbolic parameters."""
+    """Return one MX column per input of the program, then one per group of its parameters."""
     given = ((name, numbers.numel()) for name, numbers in program.given.items())
     return [ca.MX.sym(name, size) for name, size in (*program.cell_sizes, *given)]
 
 
 def _sx_inputs(program: ConvexProgram) -> list[ca.SX]:
-    """Return SX symbols for the program's inputs, without the symbolic parameters."""
+    """Return one SX column per input of the program, without the symbolic parameters."""
     return [ca.SX.sym(name, size) for name, size in program.cell_sizes]
 
 
 def wrenches_of(program: ConvexProgram, owns: list[AnyExpression]) -> list[AnyExpression]:
-    """Select the scaled wrench (wrench_size,) of each patch: the first entries of its state or
-    iterate in `owns`."""
+    """Select the scaled wrench (wrench_size,) of each patch from the states or iterates `owns`."""
     return [own[: patch.wrench_size] for patch, own in zip(program.patches, owns, strict=True)]
 
 
@@ -576,12 +579,10 @@ def degree_of(program: ConvexProgram) -> float:
 
 
 def ends_of(program: ConvexProgram) -> list[int]:
-    """Return the index at which each patch begins in the vector of all iterates, then the vector's
-    size."""
+    """Return the index at which each patch begins in the column of all iterates, then its size."""
     return [0, *accumulate(patch.iterate_size for patch in program.patches)]
 
 
 def state_ends(program: ConvexProgram) -> list[int]:
-    """Return the index at which each patch begins in the vector of all states, then the vector's
-    size."""
+    """Return where each patch of the program begins in the column of all states, then its size."""
     return [0, *accumulate(patch.state_size for patch in program.patches)]

@@ -76,8 +76,11 @@ class EvenPatch(Patch):
         return -ca.log(torsion_capacity(grip, state[1:3], self.shape)[0] ** 2 - state[3] ** 2)
 
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
-        """Compute -1 / t for a length t such that `state` + t `change`, both (4,), stays within the
-        cone. t is nearly the longest such length."""
+        """Compute -1 / t for a step length t with which `state` + t `change`, both (4,), stays
+        within the cone.
+
+        t is nearly the longest such length.
+        """
         # The friction limit: the lower eigenvalue of (N, T).
         square = self._grip_squared(state)
         mean = (state[0] * change[0] - ca.dot(state[1:3], change[1:3])) / square

@@ -117,14 +117,23 @@ class Grasp:
         return ca.vertcat(*wrenches)[self._free.tolist()]
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
-        """Compute the scaled wrenches (4,) of all pads that balance the load, the first of the
-        inputs `cell`, from their free components (free_size,)."""
+        """Compute the scaled wrenches (4,) of all pads that balance the load.
+
+        Args:
+            free: (free_size,) free components of the wrenches.
+            cell: inputs of the program, first the load.
+        """
         load, *sizes = cell
         return self._balanced_wrenches(load, free, sizes)
 
     def _balanced_wrenches(self, load: ca.SX, free: ca.SX, sizes: list[ca.SX]) -> list[ca.SX]:
-        """Compute the scaled wrenches (4,) of all pads that balance a load (6,), from their free
-        components `free` and the inputs `sizes` (friction, relative patch sizes)."""
+        """Compute the scaled wrenches (4,) of all pads that balance a load.
+
+        Args:
+            load: (6,) load.
+            free: (free_size,) free components of the wrenches.
+            sizes: friction (2,), and relative patch sizes (2,) if the program has this input.
+        """
         units = ca.vertcat(*[self.units(i, *sizes) for i in range(len(self.patches))])
         given = ca.mtimes(number(self.numbers.free_to_left), units[self._free.tolist()] * free)
         left = ca.mtimes(number(self.numbers.load_to_left), load) - given
@@ -135,8 +144,12 @@ class Grasp:
         return wrenches
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
-        """Compute half the sum of the squared magnitudes of all pad forces, from scaled wrenches
-        (4,) and the inputs `cell`."""
+        """Compute half the sum of the squared magnitudes of all pad forces, a scalar.
+
+        Args:
+            wrenches: scaled wrench (4,) of each pad.
+            cell: inputs of the program: load, then friction (2,).
+        """
         friction, total = cell[1], 0.0
         for wrench, robot in zip(wrenches, self.robots, strict=True):
             total += wrench[0] ** 2 + friction[robot] ** 2 * ca.sumsqr(wrench[1:3])
@@ -178,8 +191,12 @@ class Grasp:
         return [c + press * s for c, s in zip(chosen, given, strict=True)], share
 
     def _squeeze_scale(self, given: list[ca.SX], asked: list[ca.SX]) -> ca.SX:
-        """Compute the factor on the internal squeeze `given` with which the states `asked` plus
-        squeeze lie within the cones."""
+        """Compute a factor on the internal squeeze with which all states lie within the cones.
+
+        Args:
+            given: state (4,) of each pad in the internal squeeze.
+            asked: state (4,) of each pad to which the squeeze is added.
+        """
         shares = [p.lowest(s, a) for p, s, a in zip(self.patches, given, asked, strict=True)]
         return ca.fmax(-minimum(shares), 0.0) / START_SHARE + START_FLOOR
 

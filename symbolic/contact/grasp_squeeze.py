@@ -70,8 +70,13 @@ class GraspSqueeze(Grasp):
         return (*super()._nominal(), [1.0, 1.0], [0.0] * 4)
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
-        """Compute the scaled wrenches (4,) of all pads that, at the displaced places, balance the
-        load in `cell`, from their free components."""
+        """Compute the scaled wrenches (4,) of all pads that balance the load at the displaced
+        places.
+
+        Args:
+            free: free components of the wrenches.
+            cell: inputs of the program, with load and displacement of the pads.
+        """
         load, friction, reach, displacement = cell
         wrenches = self._balanced_wrenches(load, free, [friction, reach])
         for _ in range(DISPLACED):
@@ -82,7 +87,14 @@ class GraspSqueeze(Grasp):
         return wrenches
 
     def _turned(self, wrenches: list[ca.SX], displacement: ca.SX, sizes: list[ca.SX]) -> ca.SX:
-        """Compute the moment (3,) that the pads' forces gain by their displacement, box axes."""
+        """Compute the moment (3,) that the pads' forces gain because the pads are displaced, box
+        axes.
+
+        Args:
+            wrenches: scaled wrench (4,) of each pad.
+            displacement: (4,) displacement of each robot's pads in the pad plane [m].
+            sizes: inputs that scale the wrenches: friction (2,), relative patch sizes (2,).
+        """
         total = ca.SX.zeros(3)
         for i, (pad, robot, own) in enumerate(zip(self._pads, self.robots, wrenches, strict=True)):
             normal, *tangent = ca.vertsplit((self.units(i, *sizes) * own)[:3])
@@ -92,8 +104,13 @@ class GraspSqueeze(Grasp):
         return total
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
-        """Compute the normal force of the commanded robot plus `OTHER_WEIGHT` times the normal
-        force of the other robot, from scaled wrenches (4,)."""
+        """Compute the normal force of the commanded robot plus `OTHER_WEIGHT` times the other
+        robot's.
+
+        Args:
+            wrenches: scaled wrench (4,) of each pad.
+            cell: inputs of the program, which the effort does not need.
+        """
         total = 0.0
         for wrench, robot in zip(wrenches, self.robots, strict=True):
             total += wrench[0] * (1.0 if robot == self.commanded else OTHER_WEIGHT)

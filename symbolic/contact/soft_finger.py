@@ -157,8 +157,12 @@ def _squared(tangent: Expression) -> Expression:
 
 
 def _half_spread(patch: SoftPatch, tangent: Expression) -> Expression:
-    """Compute the length h / 2 of (1) [m] for the direction of a tangential force `tangent`
-    (2,)."""
+    """Compute the length h / 2 in formula (1) [m] for a tangential force.
+
+    Args:
+        patch: shape of the contact patch.
+        tangent: (2,) tangential force; only its direction counts.
+    """
     spread = ca.mtimes(number(patch.spread), tangent)
     return ca.sqrt(ca.sumsqr(spread) / _squared(tangent) + 1e-24) / 2.0
 

@@ -181,8 +181,12 @@ class _Local:
         return found + ca.mtimes(self._answer, self._share * ca.mtimes(self._g.T, found))
 
     def third(self, along: ca.SX, by_load: ca.SX) -> ca.SX:
-        """Compute U' T[d] U (6, 6), the third derivative of f along `along` = d (n,) and twice
-        along `by_load` = U (n, 6)."""
+        """Compute U' T[d] U (6, 6) from the third derivative T of the function f.
+
+        Args:
+            along: (n,) direction d.
+            by_load: (n, 6) directions U.
+        """
         rows = zip(
             self._program.grasp.patches,
             self._owns,

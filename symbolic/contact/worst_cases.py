@@ -210,8 +210,15 @@ def case_slack_function(workcell: Workcell, commanded: int = 1) -> ca.Function:
 def _program_and_inputs(
     workcell: Workcell, commanded: int = 1
 ) -> tuple[GraspSqueeze | None, dict[str, Expression]]:
-    """Return the convex program of pads with any normals (None for other pads), and the inputs of
-    functions of least forces by name."""
+    """Return the convex program of pads with any normals, None for other pads; and the inputs by
+    name.
+
+    The inputs are those of functions that compute least forces.
+
+    Args:
+        workcell: the cell.
+        commanded: index of the robot that is commanded by force.
+    """
     if command_model(workcell).has_scalar_squeeze:
         return None, _inputs(ca.SX, sx_parameters(workcell.payload))
     squeeze = GraspSqueeze(workcell, commanded)
@@ -219,8 +226,13 @@ def _program_and_inputs(
 
 
 def _inputs(kind: Any, given: Mapping[str, Expression]) -> dict[str, Expression]:
-    """Return symbols of type `kind` (SX or MX) by name: pose, rate, second_rate (6,) and case
-    (18,), then the parameters `given`."""
+    """Return symbols by name: pose, rate, second_rate (6,) and case (18,), then the parameters
+    `given`.
+
+    Args:
+        kind: type of the symbols, SX or MX.
+        given: symbolic parameters of the cell by group.
+    """
     motion = {name: kind.sym(name, 6) for name in MOTION}
     return motion | {"case": kind.sym("case", CASE_SIZE)} | dict(given)
 
@@ -327,8 +339,15 @@ def _commanded_by_program(
     handed: dict[str, ca.MX],
     differentiable: bool = False,
 ) -> ca.MX:
-    """Build the expression of the commanded normal forces (2,) [N] of pads with any normals, in a
-    case (18,) whose load (6,) is known."""
+    """Build the expression of the normal forces (2,) to command [N] for pads with any normals.
+
+    Args:
+        squeeze: convex program of the least commanded force.
+        load: (6,) load in this case.
+        case: (18,) case of the uncertainty.
+        handed: symbolic parameters of the cell by group.
+        differentiable: True for exact first derivatives.
+    """
     friction, *_, displacement, tracking, internal = case_parts(case)
     commanded, given = squeeze.commanded, list(handed.values())
     sizes = _sizes_function(squeeze)(case, *given)

@@ -161,7 +161,7 @@ def _check_body(seen: CacheKey) -> None:
 
 
 def arm_geometry(workcell: Workcell, i: int) -> ArmGeometry:
-    """Compute frames, axes and limits of the joints of robot i (0 or 1)."""
+    """Compute frames, axes and limits of the joints of the arm with index i (0 or 1)."""
     robot, contact = workcell.robots[i], workcell.contacts[i]
     model = arm_model(robot)
     data = model.createData()
@@ -182,7 +182,12 @@ def arm_geometry(workcell: Workcell, i: int) -> ArmGeometry:
 
 
 def _check_effort(bodies: list[CollisionBody], most_pieces: int) -> None:
-    """Check that the bodies have few enough pieces to decide on all pairs in seconds."""
+    """Check that the bodies have at most `most_pieces` convex pieces, so that pairs are decided in
+    seconds.
+
+    Raises:
+        CollisionModelError: the bodies have more pieces, or more than `MOST_CORNERS` corners.
+    """
     pieces = sum(len(body.pieces) for body in bodies)
     largest = max(bodies, key=lambda body: len(body.pieces))
     if pieces > most_pieces:
@@ -250,7 +255,18 @@ def _standing_bodies(
 
 
 def _attachment(model: pin.Model, link: str, robot: Robot, i: int) -> tuple[Frame, Array]:
-    """Return the frame to which a link is fixed, and the link's pose (4, 4) in this frame."""
+    """Return the frame to which a link is fixed, the world or a joint's frame, and the link's pose
+    in it.
+
+    Args:
+        model: Pinocchio's model of the arm.
+        link: name of the link.
+        robot: description of the robot.
+        i: index of the arm.
+
+    Returns:
+        The frame, and the link's pose (4, 4) in it.
+    """
     frame = model.frames[link_frame(model, link)]
     placement: Array = frame.placement.homogeneous
     if frame.parentJoint == 0:
@@ -343,6 +359,11 @@ def _cut_file(path: Path, scale: tuple[float, ...], state: tuple[int, int]) -> C
 
     The result is cached beyond one cell: a process that tries many variants of a cell reads its
     robots several times.
+
+    Args:
+        path: path of the mesh.
+        scale: factors along the mesh's axes.
+        state: modification time and size of the file, so that a changed file is read again.
     """
     from symbolic.geometry.hulls import cut
     from symbolic.read.meshes import read_mesh

@@ -247,7 +247,8 @@ class DistanceBounds:
         return self.soft.maximum_below(_gaps(pairs))
 
     def _interval(self, index: int, axes: Axes) -> list[Interval]:
-        """Compute the least and largest coordinate of a body along each of three directions [m]."""
+        """Compute the least and largest coordinate of body `index` along three directions `axes`
+        [m]."""
         key = (index, axes.key)
         body = self.screen.bodies[index]
         if body.extent is not None and axes is self._world:
@@ -295,9 +296,8 @@ class DistanceBounds:
         return axial + size[0]
 
     def _seen(self, frame: Frame, axes: Axes) -> tuple[ca.SX, ca.SX]:
-        """Compute a frame's rotation (3, 3) and origin (3,) [m], in coordinates along three
-        directions.
-        """
+        """Compute a frame's rotation (3, 3) and origin (3,) [m] in coordinates along the directions
+        `axes`."""
         key = (frame, axes.key)
         if key not in self._relative:
             R, p = self._placed[frame]
@@ -421,8 +421,11 @@ class DistanceBounds:
 
 
 def _ends(extent: Any, k: int) -> list[Interval]:
-    """Return the least and largest coordinate along each of three directions, from rows 2 k and 2 k
-    + 1 of extents.
+    """Return (least, largest) coordinate along each of three directions, from rows 2 k and 2 k + 1.
+
+    Args:
+        extent: (2 m, 3) table; its rows alternate between least and largest coordinates [m].
+        k: index of the pair of rows.
     """
     rows = ca.SX(number(extent))
     return [(rows[2 * k, d], rows[2 * k + 1, d]) for d in range(3)]

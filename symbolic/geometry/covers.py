@@ -175,7 +175,11 @@ def _volume(box: Piece) -> float:
 
 
 def _orientations(pieces: tuple[Piece, ...]) -> list[Array]:
-    """Return the body's axes, each piece's axes, and the principal axes of hull vertices."""
+    """Return rotations (3, 3) to try for boxes that cover a body, each once.
+
+    These are the body's axes, each piece's axes, and the principal axes of the vertices of each
+    hull.
+    """
     found = [np.eye(3)]
     for piece in pieces:
         found.append(piece.rotation)

@@ -112,7 +112,7 @@ def _may_be_cut(triangles: Array, filled: float) -> bool:
 
 
 def _warn(path: Path, text: str) -> None:
-    """Warn once; the mesh is to be corrected, not a line of this source."""
+    """Warn once that the mesh at `path` is to be corrected, with a text."""
     warnings.warn_explicit(
         text, CollisionModelWarning, filename=path.name, lineno=0, registry=_TOLD
     )
@@ -127,9 +127,10 @@ LARGE_PARTS = 24
 
 
 def _parts(mesh: trimesh.Trimesh) -> tuple[list[trimesh.Trimesh], list[NDArray[np.intp]]]:
-    """Return the components of a mesh that become hulls of their own, and the others.
+    """Split a mesh into components that become hulls of their own, and small other components.
 
-    Each of the others is an array of face indices.
+    Returns:
+        The former as meshes; the others as arrays of face indices.
     """
     nodes = np.arange(len(mesh.faces))
     parts = list(trimesh.graph.connected_components(mesh.face_adjacency, nodes=nodes, min_len=1))

@@ -260,7 +260,7 @@ def _is_own(first: str, first_stands: bool, second: str, second_stands: bool) ->
 
 
 def _arms_of(body: CollisionBody) -> tuple[int, ...]:
-    """Return the arms whose joints or base determine a body's pose."""
+    """Return the indices of the arms whose joints or base determine a body's pose."""
     if body.frame.kind == "box":
         return (0, 1)
     if body.root is not None:

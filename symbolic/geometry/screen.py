@@ -218,7 +218,7 @@ def has_hulls(body: CollisionBody) -> bool:
 
 
 def _seen(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> CacheKey:
-    """Return the cache key of a body and of the parts of both arms on which its bounds depend."""
+    """Return the cache key of a body and the arm geometry on which its bounds depend."""
     of: tuple[Any, ...] = (body.content,)
     if body.frame.kind == "link":
         of = (body.content, arms[body.frame.robot].chain)
@@ -325,12 +325,15 @@ def _reach(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> Reach:
 
 
 def reach_about_joints(body: CollisionBody, arm: ArmGeometry) -> Array:
-    """Compute upper bounds (n,) of the distances of a link's points from the axis of each joint
-    [m].
+    """Compute upper bounds (n,) of the distances of a link's points from each joint's axis [m].
 
     The entry of a prismatic joint is 1. The entry of a joint that does not move the link is 0. For
     the link's own joint the bound follows from the shape; for earlier joints the chain of links in
     between is assumed stretched.
+
+    Args:
+        body: the link.
+        arm: geometry of its arm with n joints.
     """
     reach = np.zeros(arm.joints)
     last = body.frame.joint

@@ -61,8 +61,9 @@ def moving_arms(a: CollisionBody, b: CollisionBody) -> tuple[int, ...]:
 def sorted_by_joint(
     a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry], robot: int
 ) -> tuple[CollisionBody, CollisionBody]:
-    """Return both bodies, sorted by the index of their joint; a held box is fixed to arm `robot`
-    (`anchor`).
+    """Return both bodies, the one with the earlier joint first.
+
+    A held box counts as fixed to the last joint of arm `robot` (`anchor`).
     """
     left, right = anchor(a, arms, robot), anchor(b, arms, robot)
     return (left, right) if left.frame.joint <= right.frame.joint else (right, left)

@@ -108,8 +108,11 @@ def hierarchical_basis(task: Task) -> tuple[Array, Array]:
 
 
 def _steps(pieces: int) -> list[int]:
-    """Return the distance of neighbouring waypoints in each grid, counted in waypoints of the
-    refined task, from the coarsest grid to 1."""
+    """Return the spacing of the waypoints in each grid, from the coarsest to 1.
+
+    The spacing is counted in waypoints of the refined task, which has `pieces` pieces per original
+    one.
+    """
     steps = [pieces]
     while steps[-1] > 1:
         steps.append(steps[-1] // 2 if steps[-1] % 2 == 0 else 1)

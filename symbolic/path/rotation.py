@@ -82,8 +82,12 @@ def _quaternion(v: Expression) -> Quaternion:
 def _quaternion_rates(
     v: Expression, rate: Expression, second: Expression
 ) -> tuple[Quaternion, Quaternion]:
-    """Compute the first and second time derivative of the unit quaternion of a rotation vector `v`
-    (3,), from the first and second time derivative of `v`."""
+    """Compute the first and second time derivative of the unit quaternion of a rotation vector.
+
+    Args:
+        v: (3,) rotation vector [rad].
+        rate, second: (3,) its first and second time derivative.
+    """
     square = ca.sumsqr(v)
     moved, pushed = 2.0 * ca.dot(v, rate), 2.0 * (ca.sumsqr(rate) + ca.dot(v, second))
     real, share = (_derivatives(each, square, moved, pushed) for each in (_COSINE, _SINE))
@@ -97,8 +101,13 @@ def _quaternion_rates(
 def _derivatives(
     series: Sequence[float], square: Expression, moved: Expression, pushed: Expression
 ) -> Quaternion:
-    """Compute the first and second time derivative of a power series in `square`, from the first
-    (`moved`) and second (`pushed`) time derivative of `square`."""
+    """Compute the first and second time derivative of a power series in one variable.
+
+    Args:
+        series: coefficients of the series.
+        square: the variable.
+        moved, pushed: its first and second time derivative.
+    """
     first = [n * c for n, c in enumerate(series)][1:]
     slope = _series(first, square)
     bend = _series([n * c for n, c in enumerate(first)][1:], square)
@@ -113,8 +122,12 @@ def _series(coefficients: Sequence[float], x: Expression) -> Expression:
 
 
 def _turned(w: Expression, u: Expression, w_rate: Expression, u_rate: Expression) -> Expression:
-    """Compute the vector part (3,) of 2 q' q* for a quaternion q with real part `w`, vector part
-    `u` (3,), and their time derivatives."""
+    """Compute the vector part (3,) of 2 q' q* for a quaternion q.
+
+    Args:
+        w, u: real part and vector part (3,) of q.
+        w_rate, u_rate: their time derivatives.
+    """
     return 2.0 * (w * u_rate - w_rate * u + ca.cross(u, u_rate))
 
 

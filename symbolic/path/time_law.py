@@ -163,10 +163,12 @@ def _gradient(values: ca.MX, durations: ca.MX) -> ca.MX:
 
 
 def _one_sided(here: ca.MX, near: ca.MX, far: ca.MX, near_step: ca.MX, far_step: ca.MX) -> ca.MX:
-    """Compute the derivative at `here` of the parabola through three values.
+    """Compute the derivative at the first of three values of the parabola through them.
 
-    The step from `here` to `near` is `near_step`, the step from `near` to `far` is `far_step`; both
-    are negative if they lead backwards.
+    Args:
+        here, near, far: the values; the derivative is at `here`.
+        near_step, far_step: time from `here` to `near` and from `near` to `far` [s], both negative
+            if they lead backwards.
     """
     total = near_step + far_step
     return (

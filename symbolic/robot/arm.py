@@ -235,8 +235,15 @@ def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str,
 
 
 def _placed(model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX) -> list[ca.SX]:
-    """Return the joints q (n,), their pose residual from the target [m, rad] and the flange's
-    Jacobian (6, n).
+    """Return joints q with the residual and the Jacobian there.
+
+    Args:
+        model: model of the robot.
+        q: (n,) joint positions.
+        R_target, p_target: rotation (3, 3) and position (3,) that the flange should have.
+
+    Returns:
+        The joints (n,), their pose residual from the target [m, rad], the flange's Jacobian (6, n).
     """
     R, p, jacobian = model.kinematics(q)
     return [q, pose_error(R_target, p_target, R, p)[1], jacobian]
@@ -249,8 +256,14 @@ def _function(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Functi
 def _where(
     name: str, inputs: list[ca.SX], results: list[ca.SX], otherwise: list[ca.SX]
 ) -> ca.Function:
-    """Build a conditional function: it returns `results` if its first input is true, else the
-    inputs `otherwise`."""
+    """Build a function that returns expressions if its first input is true, else other expressions.
+
+    Args:
+        name: name of the function.
+        inputs: inputs after the condition.
+        results: expressions if the condition is true.
+        otherwise: expressions of the same shapes if it is false.
+    """
     chosen = _function(name, inputs, results)
     left = _function(f"{name}_not", inputs, otherwise)
     return ca.Function.if_else(f"{name}_where", chosen, left)
@@ -468,8 +481,9 @@ def _cramer(A: ca.SX) -> Callable[[ca.SX], ca.SX]:
 
 @lru_cache(maxsize=8)
 def _independent_axes(model: RobotModel) -> tuple[int, ...]:
-    """Return the indices of three joints among the six that follow the box, such that their axes
-    stay farthest from a common plane in random postures.
+    """Return the indices of three of the six joints that follow the box, with independent axes.
+
+    In random postures the axes of these three stay farthest from a common plane.
     """
     lower, upper = model.model.lowerPositionLimit, model.model.upperPositionLimit
     postures = np.random.default_rng(0).uniform(lower, upper, (_POSTURES, len(lower)))
@@ -492,6 +506,11 @@ def _limited(model: RobotModel, q: ca.SX, step: ca.SX) -> ca.SX:
 
     The step is shortened such that no joint moves more than `MAX_JOINT_STEP`, and left out if it is
     not finite.
+
+    Args:
+        model: model of the robot.
+        q: (n,) joint positions before the step.
+        step: (6,) change of the six joints.
     """
     largest = ca.norm_inf(step)
     # At a singular posture the step is not a number: stay, and let the residual tell.

@@ -339,8 +339,13 @@ def start_branches(
 
 
 def start_flange(workcell: Workcell, robot: Robot, contact: Contact) -> Array:
-    """Compute the flange pose T_root_flange (4, 4) of an arm that holds the box at the first
+    """Compute the flange pose in the robot's root, T_root_flange (4, 4), with the box at the first
     waypoint.
+
+    Args:
+        workcell: the cell.
+        robot: the robot.
+        contact: its contact with the box.
     """
     start = workcell.task.waypoints[0].lower
     T_world_box = box_placement(workcell.task.orientation, start)

@@ -134,8 +134,13 @@ def driven_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def _value(model: CellModel, inputs: list[ca.SX], implicit: ImplicitVariables) -> ca.SX:
-    """Compute the quantities (size,) of `driven_layout` at one point from the inputs of
-    `driven_functions`."""
+    """Compute the quantities (size,) of `driven_layout` at one point of a path.
+
+    Args:
+        model: model of the cell.
+        inputs: inputs of `driven_functions`; the last two are a = u'' and w = u'^2.
+        implicit: variables of the contact forces that an equation determines.
+    """
     workcell = model.workcell
     limits, joints = limit_layout(workcell), limit_layout(workcell).joints
     *path, a, w = inputs

@@ -297,8 +297,12 @@ def _force_function(workcell: Workcell) -> ca.Function:
 
 
 def _contact_load(workcell: Workcell, wrench: ca.SX) -> ContactLoad:
-    """Return the load on the contacts along the box's axes, for the required force and moment (6,)
-    about the centre of mass [N, N m]."""
+    """Return the load on the contacts along the box's axes.
+
+    Args:
+        workcell: the cell.
+        wrench: (6,) required force and moment about the centre of mass, box axes [N, N m].
+    """
     contacts, centre = workcell.contacts, workcell.payload.centre_of_mass
     first, second = (ca.SX(number(c.T_box_pad[:3, 3] - centre)) for c in contacts)
     axes = ca.SX(number(contacts[0].T_box_pad[:3, :3]))
