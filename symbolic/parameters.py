@@ -83,8 +83,10 @@ class LazyParameter:
 
 
 class _Collector:
-    """Collects the values of parameters and returns a `Parameter` for each, its placeholder in the
-    topology."""
+    """Replacer of a cell's parameters by placeholders; it collects the values.
+
+    Each parameter becomes a `Parameter`, its placeholder in the topology.
+    """
 
     def __init__(self) -> None:
         self.entries: dict[str, list[tuple[Parameter, Array | LazyParameter]]] = {}
@@ -111,8 +113,11 @@ class _Collector:
 
 
 class _Symbols:
-    """Returns, for each parameter, its symbols: a slice of the vector of its group. Parameters must
-    come in the order in which `_Collector` took them."""
+    """Replacer of a cell's parameters by symbols.
+
+    The symbols of a parameter are a slice of the vector of its group. Parameters must come in the
+    order in which `_Collector` took them.
+    """
 
     def __init__(self, sizes: Mapping[str, int]) -> None:
         self._groups = {
@@ -283,8 +288,11 @@ class CellParameters(WorkcellParameters):
 
 
 def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
-    """Return a cell's description in which `take` has replaced all parameters. Values that no
-    formula uses become constants."""
+    """Return a cell's description in which every parameter is replaced by what `take` returns for
+    it.
+
+    Values that no formula uses become constants.
+    """
     pairs = zip(cell.robots, cell.contacts, strict=True)
     first, second = (_robot(take, i, *pair) for i, pair in enumerate(pairs))
     payload: Any = replace(cell.payload, size=np.zeros(3), shape=None, jerk_max=None)
@@ -487,8 +495,10 @@ def _joint(take: _Take, joint: RedundantJoint) -> NumberedJoint:
 
 
 def _screen(take: _Take, screen: Screen) -> Screen:
-    """Return the distance bounds in which `take` has replaced all parameters. Shapes of links and
-    of meshes remain part of the topology."""
+    """Return the numbers for distance bounds with every parameter replaced by what `take` returns.
+
+    Shapes of links and of meshes remain unchanged, as part of the topology.
+    """
     first, second = (_base(take, f"robots[{i}]", base) for i, base in enumerate(screen.bases))
     return replace(
         screen,

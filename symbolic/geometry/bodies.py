@@ -213,7 +213,14 @@ def _corners(piece: Piece) -> int:
 
 
 def _robot_bodies(robot: Robot, i: int, links: ArmLinks, meshes: MeshReader) -> list[CollisionBody]:
-    """Return the bodies of one arm and its tool."""
+    """Return the links and the tool of the arm with index i, as collision bodies.
+
+    Args:
+        robot: description of the arm.
+        i: index of the arm.
+        links: links that are modelled with the arm.
+        meshes: reader of the meshes.
+    """
     group: Group = "robot 1" if i == 0 else "robot 2"
     model = arm_model(robot)
     own = links.moved if robot.chain_root else (*links.still, *links.moved)
@@ -239,7 +246,14 @@ def _robot_bodies(robot: Robot, i: int, links: ArmLinks, meshes: MeshReader) -> 
 def _standing_bodies(
     robots: tuple[Robot, Robot], i: int, links: tuple[ArmLinks, ArmLinks], meshes: MeshReader
 ) -> list[CollisionBody]:
-    """Return the links of arm i's machine that do not move, as bodies."""
+    """Return the links of a machine that do not move, as collision bodies.
+
+    Args:
+        robots: descriptions of both arms.
+        i: index of the arm whose machine it is.
+        links: for each arm the links that are modelled with it.
+        meshes: reader of the meshes.
+    """
     robot, bodies = robots[i], []
     if not robot.chain_root:
         return []
@@ -277,8 +291,16 @@ def _attachment(model: pin.Model, link: str, robot: Robot, i: int) -> tuple[Fram
 def _link_pieces(
     robot: Robot, links: Collection[str], meshes: MeshReader
 ) -> dict[str, tuple[Piece, ...]]:
-    """Return the collision pieces of some links of a URDF, in the frame of each link and in the
-    order of the file."""
+    """Return the convex pieces of some links of a robot's URDF, by link in the order of the file.
+
+    Args:
+        robot: the robot.
+        links: names of the links.
+        meshes: reader of the meshes.
+
+    Returns:
+        Pieces by the link's name, in the link's frame.
+    """
     found_pieces = {}
     for link, collisions in robot_urdf(robot).collisions.items():
         if link not in links:

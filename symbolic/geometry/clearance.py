@@ -309,7 +309,12 @@ class DistanceBounds:
         return Axes(str(frame), self._placed[frame][0].T)
 
     def _chain(self, index: int) -> tuple[list[ca.SX], ca.SX]:
-        """Compute the centres (3,) in the world and the common radius of a body's spheres [m]."""
+        """Compute the row of equal spheres that encloses a body: centres (3,) in the world, and
+        radius [m].
+
+        Args:
+            index: index of the body.
+        """
         body = self.screen.bodies[index]
         assert body.chain is not None, "obstacles have no chains"
         if index not in self._chains:
@@ -325,7 +330,8 @@ class DistanceBounds:
         return self.soft.norm_below(self.soft.minimum_below(squared))
 
     def _chain_bound(self, i: int, j: int) -> ca.SX:
-        """Return a lower bound of the distance of bodies i and j by their chains of spheres [m].
+        """Return a lower bound of the distance of bodies i and j, each enclosed in a row of spheres
+        [m].
 
         The bound is the distance of the nearest centres minus both radii.
         """
@@ -335,8 +341,8 @@ class DistanceBounds:
     def _near_bound(self, i: int, j: int) -> ca.SX:
         """Return a lower bound of the distance of bodies i and j, piece by piece [m].
 
-        The pieces are compared along the axes of the first body's frame; of the world if this body
-        is fixed.
+        The pieces are compared along the axes of body i's frame, or of the world if body i is
+        fixed.
         """
         first, second = self.screen.bodies[i], self.screen.bodies[j]
         stands = first.extent is not None
@@ -400,10 +406,12 @@ class DistanceBounds:
         return self.soft.maximum_below(gaps)
 
     def _round_bound(self, index: int, obstacle: Obstacle) -> ca.SX:
-        """Return a lower bound of the distance between a body's spheres and a fixed round shape
+        """Return a lower bound of the distance between a moving body's spheres and a round obstacle
         [m].
 
-        The shape is a cylinder, capsule or sphere.
+        Args:
+            index: index of the moving body.
+            obstacle: a fixed cylinder, capsule or sphere.
         """
         centres, radius = self._chain(index)
         offset, size = number(obstacle.offset), ca.SX(number(obstacle.cover.size))

@@ -133,7 +133,8 @@ def world_placements(base: BasePose, placements: tuple[ca.SX, ca.SX]) -> list[tu
 
 
 def clean(matrix: Array) -> Array:
-    """Round entries within 1e-15 of -1, 0 or 1, so that expressions simplify."""
+    """Return a matrix whose entries within 1e-15 of -1, 0 or 1 are rounded, so that expressions
+    simplify."""
     rounded = np.round(matrix)
     near = (np.abs(matrix - rounded) < 1e-15) & (np.abs(rounded) <= 1.0)
     return np.where(near, rounded, matrix)

@@ -330,6 +330,10 @@ def tools_in_payload(
 def _check_tools(bodies: tuple[CollisionBody, ...], arms: tuple[ArmGeometry, ArmGeometry]) -> None:
     """Check that no tool body enters the held payload by more than `MOST_ENTERED`.
 
+    Args:
+        bodies: all collision bodies.
+        arms: joints of both arms, with the pose of the held box.
+
     Raises:
         CollisionModelError: a tool body enters the payload.
     """
@@ -343,9 +347,9 @@ def _check_tools(bodies: tuple[CollisionBody, ...], arms: tuple[ArmGeometry, Arm
 
 
 def _rigid(a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> str:
-    """Return the reason to exclude a pair whose bodies do not move relative to each other.
+    """Return the reason to exclude two bodies that do not move relative to each other; else ''.
 
-    Both are fixed to one frame, or the grasp holds them together. The result is '' for other pairs.
+    Both are fixed to one frame, or both are held together by the grasp of the arms.
     """
     if a.frame != b.frame and "box" not in (a.frame.kind, b.frame.kind):
         return ""
@@ -365,7 +369,11 @@ def _rigid(a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeome
 
 def _neighbours(a: CollisionBody, b: CollisionBody, bodies: tuple[CollisionBody, ...]) -> str:
     """Return the reason to exclude two neighbouring links of one arm, or an arm's mount and its
-    first link; '' for other pairs.
+    first link; else ''.
+
+    Args:
+        a, b: the two bodies.
+        bodies: all collision bodies.
     """
     for standing, link in ((a, b), (b, a)):
         if link.frame.robot in (standing.carries or ()) and not link.is_tool:
@@ -383,9 +391,14 @@ def _neighbours(a: CollisionBody, b: CollisionBody, bodies: tuple[CollisionBody,
 def _always_touching(
     a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]
 ) -> str:
-    """Return the reason to exclude two bodies that touch in every sampled posture of an arm.
+    """Return the reason to exclude two bodies of one arm that touch in every sampled posture; else
+    ''.
 
-    The bodies belong to this arm; one may be the held box. The result is '' for other pairs.
+    One of the bodies may be the held box.
+
+    Args:
+        a, b: the two bodies.
+        arms: joints of both arms.
     """
     own = {body.group for body in (a, b) if body.carries is None}
     for robot in moving_arms(a, b):

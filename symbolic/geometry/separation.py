@@ -49,9 +49,9 @@ def _anchored(seen: CacheKey) -> CollisionBody:
 
 
 def moving_arms(a: CollisionBody, b: CollisionBody) -> tuple[int, ...]:
-    """Return the indices of the arms that may move one body relative to the other.
+    """Return the indices of the arms, 0 or 1, that may move bodies a and b relative to each other.
 
-    For the payload these are both arms.
+    If one of them is the payload, these are both arms.
     """
     if "box" in (a.frame.kind, b.frame.kind):
         return (0, 1)
@@ -273,8 +273,12 @@ def _convex(hull: Hull) -> coal.CollisionGeometry:
 
 
 def coal_distance(first: tuple[Piece, ...], second: tuple[Piece, ...]) -> float:
-    """Compute the least distance [m] between two sets of pieces in one frame; negative if they
-    overlap.
+    """Compute the least distance [m] between two bodies, given as convex pieces in one frame.
+
+    The distance is negative if the bodies overlap.
+
+    Args:
+        first, second: pieces of the bodies.
     """
     request, result = coal.DistanceRequest(), coal.DistanceResult()
     left, right = [coal_geometry(p) for p in first], [coal_geometry(p) for p in second]

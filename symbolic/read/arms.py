@@ -121,7 +121,8 @@ class RobotModelWarning(DualArmWarning):
 
 @cache
 def _warn_left_out(file: str, joint: str, mimicked: str) -> None:
-    """Warn once that a joint does not follow the joint that it mimics."""
+    """Warn once that a joint of the URDF `file` does not follow the joint `mimicked` that it
+    mimics."""
     warnings.warn(
         f"{file}: joint {joint!r} does not follow {mimicked!r}, which moves; what hangs on it has "
         "neither shape nor mass",
@@ -192,7 +193,7 @@ def without_links(urdf: Urdf, patterns: tuple[str, ...]) -> Urdf:
 
 
 def listed(names: Sequence[str], most: int = 20) -> str:
-    """List names for a message, at most the first `most`."""
+    """Return names for a message, separated by commas; after `most` names the rest is counted."""
     text = ", ".join(repr(name) for name in names[:most]) or "none"
     return f"{text} and {len(names) - most} more" if len(names) > most else text
 
@@ -226,8 +227,18 @@ def reduced_model(urdf: Urdf, held: Positions = ()) -> pin.Model:
 
 @lru_cache(maxsize=16)
 def _reduced(kinematics: str, file: str, held: Positions) -> pin.Model:
-    """Return the Pinocchio model of a URDF with some joints held. The result is cached, so callers
-    must not modify it."""
+    """Return the Pinocchio model of a URDF with some joints held.
+
+    The result is cached, so callers must not modify it.
+
+    Args:
+        kinematics: URDF text of the links and joints.
+        file: name of the file, for messages.
+        held: names and positions of the held joints [rad or m].
+
+    Raises:
+        RobotModelError: Pinocchio refuses the description.
+    """
     try:
         model = pin.buildModelFromXML(kinematics)
     except (ValueError, RuntimeError, IndexError) as error:
@@ -293,7 +304,14 @@ def arm_model(robot: Robot) -> pin.Model:
 
 @lru_cache(maxsize=16)
 def _problems(kinematics: str, file: str, held: Positions, flange: str) -> tuple[str, ...]:
-    """List the reasons why a description is not a serial arm with this flange."""
+    """Return the reasons why a description is not a serial arm with this flange; () if it is.
+
+    Args:
+        kinematics: URDF text of the links and joints.
+        file: name of the file, for messages.
+        held: names and positions of the held joints [rad or m].
+        flange: name of the flange's frame.
+    """
     model = _reduced(kinematics, file, held)
     found = structure_problem(model), flange_problem(model, flange)
     return tuple(problem for problem in found if problem)
@@ -328,7 +346,7 @@ def structure_problem(model: pin.Model) -> str:
 
 
 def flange_problem(model: pin.Model, flange: str) -> str:
-    """Return why a frame cannot carry the tool; '' if it can."""
+    """Return why the frame `flange` of a model cannot carry the tool; '' if it can."""
     bodies = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
     tip = model.njoints - 1
     last = [x for x in bodies if model.frames[link_frame(model, x)].parentJoint == tip]
@@ -346,8 +364,11 @@ def link_frame(model: pin.Model, link: str) -> int:
 
 
 def link_lengths(model: pin.Model, flange: str) -> Array:
-    """Compute the distances (n,) from each joint of an arm to the next, the last to the
-    flange [m].
+    """Compute the distances (n,) from each joint to the next and from the last to the flange [m].
+
+    Args:
+        model: model of an arm with n joints.
+        flange: name of the flange's frame.
     """
     offsets = [model.jointPlacements[joint].translation for joint in range(2, model.njoints)]
     offsets.append(model.frames[link_frame(model, flange)].placement.translation)
@@ -360,11 +381,14 @@ thirteen arms of 0.74 to 1.75 m are below it, 6 % for a GoFa 12."""
 
 
 def usual_manipulability(model: pin.Model, flange: str) -> float:
-    """Compute the default of `min_manipulability` for an arm, to two digits [m^3].
+    """Compute the default of the least allowed manipulability of an arm, to two digits [m^3].
 
     The default scales with the cube of the arm's length, as the manipulability does. The length
-    covers the last seven joints. Joints that move the whole arm, such as a lift, are not part of
-    it.
+    covers the last seven joints, without joints that move the whole arm, such as a lift.
+
+    Args:
+        model: model of the arm.
+        flange: name of the flange's frame.
     """
     length = float(link_lengths(model, flange)[-FOLLOWING - 1 :].sum())
     return float(f"{MANIPULABILITY_SHARE * length**3:.1e}")
@@ -408,7 +432,8 @@ def one_machine(robots: Arms) -> bool:
 
 
 def arm_links(robots: Arms, i: int) -> ArmLinks:
-    """Return the links that are modelled with arm i (0 or 1)."""
+    """Return the links that are modelled as bodies of arm i (0 or 1); the arms may share a
+    machine."""
     carried = _carriers(robots[i])
     still = [link for link in carried if carried[link] == UNMOVED]
     moved = [link for link in carried if carried[link] != UNMOVED]

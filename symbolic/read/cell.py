@@ -121,8 +121,18 @@ def changed(workcell: Workcell, changes: Mapping[str, Any]) -> Workcell:
 def _build(
     table: TableReader, source: Path, content: bytes, stored: bool, reach: bool
 ) -> Workcell | None:
-    """Build as many records as possible; return None if a section has the wrong number of
-    entries."""
+    """Build the workcell from its tables as far as possible; record the problems.
+
+    Args:
+        table: reader of the file's top level; it collects the problems.
+        source: path of the file.
+        content: content of the file.
+        stored: whether the cell was unpacked from an archive.
+        reach: True to check that fixed poses are within the arms' reach.
+
+    Returns:
+        The workcell; None if the number of robots or contacts is not two.
+    """
     problems, folder = table.problems, source.parent
     name = table.text("name")
     robots = [read_robot(entry, folder, stored) for entry in table.tables("robots", exactly=2)]
@@ -297,7 +307,10 @@ def changed_text(content: bytes, changes: Mapping[str, Any], file: str) -> bytes
 
 @lru_cache(maxsize=4)
 def _tables_of(content: bytes) -> dict[str, Any]:
-    """Parse the tables of a file. The result is cached; callers must not modify it."""
+    """Parse a workcell file into nested dictionaries.
+
+    The result is cached; callers must not modify it.
+    """
     return safe_io.toml_tables(content)
 
 
@@ -343,7 +356,7 @@ def _among(tables: list[dict[str, Any]], rest: str) -> Iterator[tuple[dict[str, 
 
 
 def _plain(value: Any) -> Any:
-    """Convert NumPy values to plain values of TOML."""
+    """Convert a value, with NumPy arrays and numbers inside, to lists and numbers for TOML."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):
@@ -360,7 +373,8 @@ REACH_SLACK = 1e-6  # [m], rounding of a flange exactly at full stretch
 
 
 def check_names(workcell: Workcell, problems: Problems) -> None:
-    """Check that names that address something are unique."""
+    """Record a problem for each name that is not unique although key paths or options
+    address it."""
     robots = [(f"robots[{i}].name", robot.name) for i, robot in enumerate(workcell.robots)]
     bodies = [(f"environment[{i}].name", b.name) for i, b in enumerate(workcell.environment)]
     _check_unique([("'payload' (reserved)", PAYLOAD_NAME), *robots, *bodies], problems)
@@ -389,7 +403,7 @@ def _check_unique(entries: list[tuple[str, str]], problems: Problems) -> None:
 
 
 def check_contacts(workcell: Workcell, problems: Problems) -> None:
-    """Check that the pads hold the payload under every motion."""
+    """Record a problem if the pads cannot hold the payload under every motion."""
     if not problems.clean("contacts", "task.allocation", *SHAPE_KEYS):
         return
     if problem := contact_model(workcell).problem:
@@ -397,7 +411,7 @@ def check_contacts(workcell: Workcell, problems: Problems) -> None:
 
 
 def check_uncertainty(workcell: Workcell, problems: Problems) -> None:
-    """Check that displaced pads stay partly on their patches, and that the patches still face each
+    """Record a problem if displaced pads may leave their patches, or patches no longer face each
     other."""
     displaced = workcell.uncertainty.pad_position
     if not (displaced and workcell.uncertainty.stated) or not problems.clean(
@@ -421,8 +435,10 @@ def check_uncertainty(workcell: Workcell, problems: Problems) -> None:
 
 
 def check_shapes(workcell: Workcell, problems: Problems) -> None:
-    """Check that the shapes do not exceed the allowed number of convex pieces. A mesh counts as at
-    least one."""
+    """Record a problem if the shapes have more convex pieces than allowed.
+
+    A mesh counts as at least one piece.
+    """
     most = workcell.collision.most_pieces
     if not problems.clean("collision.most_pieces", *_of_robots("urdf")):
         return
@@ -443,7 +459,7 @@ def check_shapes(workcell: Workcell, problems: Problems) -> None:
 
 
 def check_references(workcell: Workcell, problems: Problems) -> None:
-    """Check that the names in allowed contacts and ignored pairs exist."""
+    """Record a problem for each name in allowed contacts or ignored pairs that does not exist."""
     if not problems.clean("environment"):
         return
 
@@ -473,14 +489,14 @@ def _of_robots(*parts: str) -> list[str]:
 
 
 def check_machine(workcell: Workcell, problems: Problems) -> None:
-    """Check that two arms of one machine move independently and agree on the links that do not
-    move."""
+    """Record a problem if two arms of one machine do not move independently, or disagree on fixed
+    links."""
     if problems.clean(*_of_robots(*ARM_KEYS)) and (problem := machine_problem(workcell.robots)):
         problems.add("robots[1].chain", problem)
 
 
 def check_speeds(workcell: Workcell, problems: Problems) -> None:
-    """Check that the reference speeds are within the payload's limits."""
+    """Record a problem if a reference speed exceeds the payload's limit."""
     for key, limit_key in (
         ("reference_speed", "velocity_max"),
         ("reference_angular_speed", "angular_velocity_max"),
@@ -494,9 +510,10 @@ def check_speeds(workcell: Workcell, problems: Problems) -> None:
 
 
 def check_reach(workcell: Workcell, problems: Problems) -> None:
-    """Check that no fixed pose is farther away than the stretched length of an arm.
+    """Record a problem for each fixed pose that is farther away than the stretched length of an
+    arm.
 
-    The check is necessary, not sufficient: it needs no inverse kinematics.
+    Poses that pass may still be out of reach: no inverse kinematics is computed.
     """
     poses = [(path, pose) for path, pose in _fixed_poses(workcell) if problems.clean(path)]
     for index, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):

@@ -158,7 +158,14 @@ class StoredFile:
 
 @dataclass(frozen=True)
 class StoredFiles:
-    """A `CellFiles` record as JSON values."""
+    """The files of a workcell (`CellFiles`) as JSON values.
+
+    Attributes:
+        workcell: path of the workcell file among the files.
+        digest: digest of the workcell as unpacked.
+        folders: package folders that have to exist, as relative POSIX paths.
+        files: the files with their content.
+    """
 
     workcell: str
     digest: str
@@ -167,7 +174,8 @@ class StoredFiles:
 
 
 def cell_to_json(stored: CellFiles) -> dict[str, Any]:
-    """Convert a workcell's files to the JSON values of `StoredFiles`."""
+    """Convert a workcell's files to a dictionary for JSON, with the fields of `StoredFiles` as
+    keys."""
     files = [asdict(_packed(name, stored.files[name])) for name in sorted(stored.files)]
     return {
         "workcell": stored.workcell,
@@ -246,7 +254,12 @@ def _is_plain(name: str) -> bool:
 
 
 def _check_references(stored: CellFiles, root: Path) -> None:
-    """Check that no workcell file or URDF refers to anything outside the stored files."""
+    """Check that no workcell file or URDF refers to anything outside the stored files.
+
+    Args:
+        stored: the files.
+        root: folder to which their paths are relative.
+    """
     base = posixpath.dirname(stored.workcell)
     for reference, package_dirs in references(parse_toml(stored.files[stored.workcell])):
         target = joined(base, reference)
@@ -435,12 +448,13 @@ def _replaced(text: str, reference: str, moved: str, file: str) -> str:
 
 
 def joined(base: str, reference: str) -> str:
-    """Resolve a reference that is relative to `base`, including `..`."""
+    """Return the path of `reference`, which is relative to the folder `base`, with every `..`
+    resolved."""
     return posixpath.normpath(posixpath.join(base, reference))
 
 
 def parse_toml(content: bytes) -> dict[str, Any]:
-    """Parse the tables of a workcell file.
+    """Parse a workcell file into nested dictionaries.
 
     Raises:
         BundleError: the content is not TOML.

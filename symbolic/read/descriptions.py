@@ -66,7 +66,13 @@ def find_package(name: str, package_dirs: Sequence[Path], description: Path) -> 
 
 
 def _packages(name: str, package_dirs: Sequence[Path], description: Path) -> Iterator[Path]:
-    """Yield the folders of a package in order of precedence."""
+    """Yield the folders of a package, in the order of precedence that `find_package` states.
+
+    Args:
+        name: name of the package.
+        package_dirs: folders of packages that the workcell names.
+        description: the file that names the package.
+    """
     for folder in package_dirs:
         package = package_in(folder, name)
         if package is not None:
@@ -112,7 +118,7 @@ def _package_name(folder: Path) -> str | None:
 def further_package_dirs(
     addresses: Iterable[str], package_dirs: Sequence[Path], description: Path
 ) -> tuple[Path, ...]:
-    """Return the folders, outside `package_dirs`, that contain the packages of mesh addresses.
+    """Return the folders, outside `package_dirs`, of packages that mesh addresses name.
 
     Each folder is listed once. Packages that are not found are left out.
 
@@ -136,7 +142,7 @@ def _paths(variable: str) -> Iterator[Path]:
 
 
 def _below(folder: Path, name: str, levels: int) -> Iterator[Path]:
-    """Yield the folders of a package in a folder, or up to `levels` below it."""
+    """Yield folders of the package `name`: a folder itself, or folders up to `levels` below it."""
     is_package = (folder / "package.xml").is_file()
     if folder.name == name and is_package:
         yield folder
@@ -275,10 +281,18 @@ def nominal_kinematics(content: bytes, arguments: Arguments) -> str:
 def _expanded(
     path: Path, content: bytes, arguments: Arguments, package_dirs: tuple[Path, ...]
 ) -> tuple[bytes | None, Parts]:
-    """Return the expanded text of a xacro file, and path and digest of every included file.
+    """Expand a xacro file in a process of its own.
 
-    The text is None if the expansion took too long. Results are cached, since both robots of a cell
-    may name one file.
+    Results are cached, since both robots of a cell may name one file.
+
+    Args:
+        path: path of the file.
+        content: content of the file, part of the cache's key.
+        arguments: values of the file's arguments, by name.
+        package_dirs: folders of packages in which `$(find NAME)` looks first.
+
+    Returns:
+        URDF text, None if the expansion took too long; path and digest of every included file.
     """
     answer = _answer(
         {
@@ -295,7 +309,8 @@ def _expanded(
 
 
 def _answer(request: Any) -> Any:
-    """Send a request to the process that expands, and return its answer; None after a timeout."""
+    """Send a request, a JSON value, to a process that expands xacro; return its answer, None after
+    a timeout."""
     paths = [os.path.abspath(entry) for entry in sys.path]
     with tempfile.TemporaryFile() as answer:
         try:
@@ -384,7 +399,13 @@ def _limit(size: int) -> None:
 
 
 def _refuse_access(event: str, arguments: tuple[Any, ...]) -> None:
-    """Audit hook that lets an expansion read files and refuses every other access."""
+    """Refuse, as an audit hook of Python, every access other than reading files during an
+    expansion.
+
+    Args:
+        event: name of the audit event.
+        arguments: values that Python passes with the event.
+    """
     writes = event == "open" and isinstance(arguments[2], int) and arguments[2] & _WRITING
     if writes or (event.startswith(_REFUSED) and event not in _LOOKING):
         raise OutsideError(
@@ -395,7 +416,17 @@ def _refuse_access(event: str, arguments: tuple[Any, ...]) -> None:
 def _expand(
     xacro: Any, path: Path, arguments: Mapping[str, str], package_dirs: list[str]
 ) -> dict[str, Any]:
-    """Return the expanded text and the paths of the included files."""
+    """Expand a xacro file in this process.
+
+    Args:
+        xacro: the module `xacro`.
+        path: path of the file.
+        arguments: values of the file's arguments, by name.
+        package_dirs: folders of packages in which `$(find NAME)` looks first.
+
+    Returns:
+        The URDF text under the key `urdf`, the paths of the included files under `included`.
+    """
     found: dict[str, Path] = {}
 
     def find(name: str) -> str:
@@ -437,7 +468,12 @@ def _opened(name: str) -> io.StringIO:
 
 
 def _by_package(address: str, packages: Mapping[str, Path]) -> str:
-    """Replace this machine's package folders in a mesh address by `package://NAME`."""
+    """Return a mesh address with the folder of one of the packages replaced by `package://NAME`.
+
+    Args:
+        address: the address.
+        packages: folder of each package by name.
+    """
     for name, folder in packages.items():
         start = f"{folder}/"
         if address.removeprefix("file://").startswith(start):
@@ -446,7 +482,12 @@ def _by_package(address: str, packages: Mapping[str, Path]) -> str:
 
 
 def _refusal(error: BaseException, xacro: Any) -> OutsideError:
-    """Return the `OutsideError` for an error of an expansion, with the file and the macro."""
+    """Convert an error of an expansion to an `OutsideError` that names the file and the macro.
+
+    Args:
+        error: the error.
+        xacro: the module `xacro`, which knows the place.
+    """
     causes = [error]
     for one in causes:  # an error and those that it was made of
         inner = (getattr(one, "exc", None), one.__cause__, one.__context__)

@@ -126,7 +126,7 @@ def _edited(
 
 
 def _alike(found: Any, wanted: Any) -> bool:
-    """Return True if two nested values are equal; NaN equals NaN."""
+    """Return True if two nested values are equal, with NaN equal to NaN."""
     if isinstance(found, Mapping) and isinstance(wanted, Mapping):
         return found.keys() == wanted.keys() and all(_alike(found[k], wanted[k]) for k in found)
     if isinstance(found, list) and isinstance(wanted, list):
@@ -209,7 +209,7 @@ def _last_body(place: Any) -> list[Any]:
 
 
 def _item(value: Any) -> Any:
-    """Convert a value to TOML: tables with headings, one row of numbers per line."""
+    """Convert a value to a tomlkit item: tables with headings, one row of numbers per line."""
     if isinstance(value, Mapping):
         table = tomlkit.table()
         for key, entry in value.items():

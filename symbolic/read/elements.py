@@ -143,7 +143,8 @@ class ElementReader:
         return found
 
     def all(self, tag: str) -> list[ElementReader]:
-        """Return every inner element with a tag. These are not added to `kept`."""
+        """Return a reader of every inner element with a tag. These elements are not added to
+        `kept`."""
         path = f"{self.path}/{tag}".removeprefix("/")
         return [
             ElementReader(element, f"{path}[{index}]", self.problems)
@@ -168,7 +169,8 @@ class ElementReader:
         return (self.element.findtext(tag) or "").strip()
 
     def text(self, key: str, most: int = MOST_NAME) -> str:
-        """Read an attribute as a printable text of 1 to `most` characters; '' after a problem."""
+        """Read the attribute `key` as a printable text of 1 to `most` characters; '' after a
+        problem."""
         value = self.raw(key)
         if value is None:
             self.problems.add(self.at(key), "is missing")
@@ -182,7 +184,7 @@ class ElementReader:
         return ""
 
     def choice(self, key: str, allowed: Sequence[str]) -> str:
-        """Read an attribute that is one of the allowed words; '' after a problem."""
+        """Read the attribute `key`, one of the words in `allowed`; '' after a problem."""
         value = self.text(key)
         if value and value not in allowed:
             hint = suggestion(value, allowed)
@@ -194,7 +196,13 @@ class ElementReader:
         return value
 
     def number(self, key: str, allowed: Range, default: str | None = None) -> float:
-        """Read an attribute as a finite number within a range."""
+        """Read an attribute as a finite number.
+
+        Args:
+            key: name of the attribute.
+            allowed: range of the number.
+            default: text for a missing attribute; None if it is required.
+        """
         return float(self.numbers(key, (allowed,), default)[0])
 
     def numbers(self, key: str, allowed: Sequence[Range], default: str | None = None) -> Array:

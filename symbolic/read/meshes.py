@@ -57,7 +57,12 @@ def read_mesh(path: Path, scale: Array) -> trimesh.Trimesh:
 
 
 def _sound(mesh: trimesh.Trimesh, scale: Array) -> trimesh.Trimesh:
-    """Scale a mesh, and check that it is finite, within limits and not flat."""
+    """Return a mesh multiplied by the factors `scale` (3,), in metres and with equal vertices
+    merged.
+
+    Raises:
+        OutsideError: the mesh is not finite, exceeds a limit or is flat.
+    """
     if not np.all(np.isfinite(mesh.vertices)):
         raise OutsideError("the mesh has vertices that are not finite numbers", code="not-finite")
     _require_few(len(mesh.faces), MOST_FACES, "triangles")
@@ -133,9 +138,9 @@ def _read(path: Path) -> trimesh.Trimesh:
 
 
 def _is_text(kind: str, content: bytes) -> bool:
-    """Return True if a mesh file is parsed word by word.
+    """Return True if a mesh file of a format `kind` is parsed word by word.
 
-    An STL text is not, since only its numbers are parsed.
+    An STL text counts as False, since only its numbers are parsed.
     """
     second = content[:1000].split(b"\n", 2)[1:2]
     return kind in ("obj", "off") or (kind == "ply" and b"binary" not in b"".join(second).lower())

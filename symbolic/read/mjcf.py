@@ -25,7 +25,8 @@ NO_READER = "is a file of MuJoCo, whose reader is not installed: pip install 'du
 
 
 def compiled(path: Path) -> Any:
-    """Load an MJCF file with MuJoCo. Return the module `mujoco`, the file's `MjSpec` and `MjModel`.
+    """Load an MJCF file with MuJoCo; return the module `mujoco`, the file's `MjSpec` and its
+    `MjModel`.
 
     Raises:
         OutsideError: MuJoCo is not installed, or refuses the file.
@@ -121,9 +122,9 @@ class _Writer:
         return ElementTree.tostring(self._root)
 
     def _joints(self, body: int, name: str) -> None:
-        """Write the joints between a body and its parent.
+        """Write the joints between the body with index `body` and its parent as URDF joints.
 
-        Each joint has its own point in the body about which it turns.
+        Each joint turns about its own point of the body. `name` is the name of the body's link.
         """
         model, kinds = self._model, self._mujoco.mjtJoint
         parent = self._names[model.body_parentid[body]]

@@ -86,6 +86,11 @@ def _mesh(table: TableReader, folder: Path, mass: float) -> Payload:
     """Read a payload with the shape of a mesh.
 
     The density is uniform within the surface, or within the convex hull if the surface has holes.
+
+    Args:
+        table: the payload's section of the workcell file.
+        folder: folder to which the path of the mesh is relative.
+        mass: mass of the payload [kg].
     """
     path = read_file(table, "path", folder, safe_io.MESH_BYTES)
     scale = table.vector("scale", (quantity.SCALE,) * 3, (1.0, 1.0, 1.0), filling=True)
@@ -138,7 +143,12 @@ ALONG_Z = 0.9  # share of a normal along z from which on a pad's x axis is measu
 
 
 def read_contact(table: TableReader, payload: Payload) -> Contact:
-    """Read the pads of one robot on the payload."""
+    """Read the pads of one robot.
+
+    Args:
+        table: the robot's entry of `contacts` in the workcell file.
+        payload: the payload on whose surface the pads are.
+    """
     friction = table.number("friction", quantity.FRICTION)
     half_sides: tuple[float, float] | None = None
     if table.has("patch_size"):
@@ -169,9 +179,7 @@ def read_contact(table: TableReader, payload: Payload) -> Contact:
 
 
 def check_count(contacts: list[Contact], problems: Problems) -> None:
-    """Check that the contacts have at most `MOST_PADS` pads, or `MOST_HANDS` with holding
-    forces.
-    """
+    """Record a problem if the contacts have more than `MOST_PADS` pads, or `MOST_HANDS` hands."""
     count = sum(1 + len(contact.further) for contact in contacts)
     allowed = MOST_HANDS if any(contact.holding_force for contact in contacts) else MOST_PADS
     if count > allowed:

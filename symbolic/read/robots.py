@@ -113,7 +113,12 @@ def read_robot(table: TableReader, folder: Path, stored: bool = False) -> tuple[
 
 
 def _read_redundant(table: TableReader, model: pin.Model | None) -> tuple[str, ...]:
-    """Read the names of the redundant joints; () if the file names none."""
+    """Read the names of an arm's redundant joints; () if the file names none.
+
+    Args:
+        table: the arm's section of the workcell file.
+        model: model of the arm; None after problems.
+    """
     names = table.texts("redundant_joints", "names of joints")
     if model is None or not names:
         return names
@@ -156,7 +161,12 @@ def _warn_unjudged(robot: str) -> None:
 
 
 def _read_limits(table: TableReader, model: pin.Model | None) -> dict[str, Array | None]:
-    """Read the joint limits (n,) by key, from the file, else from the robot's description."""
+    """Read the limits (n,) of n joints by key, from the file, else from the robot's description.
+
+    Args:
+        table: the arm's section of the workcell file.
+        model: model of the arm; None after problems.
+    """
     n, found = FOLLOWING if model is None else model.nq, dict[str, Array | None]()
     for key, (own, allowed) in LIMIT_KEYS.items():
         if key == "torque_max" and table.raw(key, None) == UNKNOWN_TORQUE:
@@ -270,9 +280,14 @@ def _read_description(
 
 
 def _check_arguments(table: TableReader, path: Path, arguments: Arguments) -> None:
-    """Check that xacro arguments are given only for files that take them.
+    """Record a problem if xacro arguments are given for a file that takes none.
 
     Warn if the argument with the arm's calibration is missing or nominal.
+
+    Args:
+        table: the arm's section of the workcell file.
+        path: path of the robot's description.
+        arguments: the xacro arguments, by name.
     """
     content = safe_io.read_bytes(path, safe_io.URDF_BYTES)
     if arguments and not takes_arguments(content):
@@ -284,7 +299,8 @@ def _check_arguments(table: TableReader, path: Path, arguments: Arguments) -> No
 
 @cache
 def _warn_nominal(robot: str, argument: str) -> None:
-    """Warn once that a robot's calibration is not given."""
+    """Warn once that the calibration of `robot`, a xacro argument called `argument`, is not
+    given."""
     warnings.warn(
         f"robot {robot!r} has its maker's nominal kinematics; name the file of the arm's own "
         f"calibration by xacro_arguments.{argument}",
@@ -294,13 +310,13 @@ def _warn_nominal(robot: str, argument: str) -> None:
 
 
 def _argument(value: str, folder: Path) -> str:
-    """Return the value of a xacro argument, with a relative path made absolute."""
+    """Return the value of a xacro argument, with a path relative to `folder` made absolute."""
     return str((folder / value).resolve()) if value.startswith(RELATIVE) else value
 
 
 @contextmanager
 def _recorded(table: TableReader, key: str) -> Iterator[None]:
-    """Record errors that are raised in the `with` block as problems of a key."""
+    """Record errors that are raised in the `with` block as problems of the key `key` in a table."""
     try:
         yield
     except UrdfError as error:
@@ -349,7 +365,14 @@ def _read_folders(table: TableReader, folder: Path) -> tuple[Path, ...]:
 def _read_described(
     table: TableReader, key: str, folder: Path, package_dirs: tuple[Path, ...]
 ) -> Path:
-    """Read a path relative to the workcell's folder, or an address package://NAME/..."""
+    """Read the path of a robot's file at a key: a relative path, or an address package://NAME/...
+
+    Args:
+        table: the arm's section of the workcell file.
+        key: the key.
+        folder: folder to which a path is relative.
+        package_dirs: folders of packages for an address.
+    """
     address = table.raw(key, None)
     if not isinstance(address, str) or not address.startswith(PACKAGE_SCHEME):
         return read_file(table, key, folder, safe_io.URDF_BYTES)
@@ -366,7 +389,7 @@ def _read_described(
 
 
 def _read_chain(table: TableReader) -> tuple[str, str]:
-    """Read the links at which the arm begins and ends.
+    """Read the names of the links at which the arm begins and ends.
 
     The first name is '' if the file states the flange alone.
     """

@@ -77,7 +77,16 @@ class ImportedScene:
 
 @dataclass
 class SceneBuilder:
-    """Collector of the bodies of a scene."""
+    """Collector of the bodies of a scene.
+
+    Attributes:
+        bodies: bodies in the world frame.
+        left_out: parts that could not become bodies, each 'NAME: reason'.
+        notes: differences between a body and the scene, each 'NAME: text'.
+        files: embedded meshes, as STL content by path.
+        problems: collector of problems.
+        names: names that are taken.
+    """
 
     bodies: list[Body] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
@@ -190,11 +199,11 @@ class SceneBuilder:
         self.add(name, *slab_below(pose))
 
     def leave(self, name: str, why: str) -> None:
-        """Report that a part of the scene is left out, with the reason `why`."""
+        """Report that the part `name` of the scene is left out, with the reason `why`."""
         self.left_out.append(f"{safe_io.printable(name) or 'scene'}: {why}")
 
     def note(self, name: str, what: str) -> None:
-        """Report how a body differs from the scene."""
+        """Report in the text `what` how the body `name` differs from the scene."""
         self.notes.append(f"{safe_io.printable(name) or 'scene'}: {what}")
 
     def _name(self, name: str) -> str:

@@ -335,7 +335,7 @@ def read_message(path: Path) -> dict[str, Any]:
 
 
 def _read_moveit(path: Path, found: SceneBuilder) -> None:
-    """Add the bodies of a planning scene's message, or of a message with its world alone.
+    """Add the bodies of a MoveIt message, a planning scene or its world alone, to `found`.
 
     Raises:
         OutsideError: the file is not such a message.
@@ -450,7 +450,7 @@ def _primitive(name: str, kind: str, sizes: Array, pose: Array, found: SceneBuil
 def _moveit_mesh(
     name: str, table: TableReader, pose: Array, path: Path, found: SceneBuilder
 ) -> None:
-    """Add a mesh that the message states by an address or by its triangles."""
+    """Add a mesh, at `pose` (4, 4) in the world, that a message states by address or triangles."""
     if table.has("resource"):
         scale = table.vector("dimensions", (ANY,) * 3, (1.0, 1.0, 1.0))
         found.mesh(name, str(table.raw("resource")), path, scale, pose)
@@ -470,7 +470,7 @@ def _moveit_mesh(
 
 
 def _triangles(name: str, vertices: Any, faces: Any, pose: Array, found: SceneBuilder) -> None:
-    """Add a mesh that a file states by lists of vertices and of vertex indices."""
+    """Add a mesh, at `pose` (4, 4) in the world, from lists of vertices [m] and of indices."""
     try:
         places = np.array(vertices, dtype=float).reshape(-1, 3)
         corners = np.array(faces, dtype=float).reshape(-1, 3)
@@ -563,7 +563,7 @@ def _written_object(name: str, words: Sequence[str], placed: bool, found: SceneB
 
 
 def _read_mjcf(path: Path, found: SceneBuilder) -> None:
-    """Add the shapes of the world and of bodies fixed in it, at the poses that MuJoCo computes."""
+    """Add the shapes of an MJCF file's world and fixed bodies to `found`, as MuJoCo poses them."""
     mujoco, _, model = compiled(path)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)

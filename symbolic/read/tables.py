@@ -79,7 +79,8 @@ class TableReader:
         return f"{self.path}.{key}" if self.path else key
 
     def add(self, key: str, text: str) -> None:
-        """Record a problem with the value of a key."""
+        """Record a problem with the value of a key; `text` says what is wrong and what is
+        allowed."""
         self.problems.add(self.at(key), text)
 
     def clean(self, *keys: str) -> bool:
@@ -87,10 +88,9 @@ class TableReader:
         return self.problems.clean(*map(self.at, keys))
 
     def raw(self, key: str, default: Any = _REQUIRED) -> Any:
-        """Return a value as it is in the document.
+        """Return the value of a key as it is in the document, `default` for a missing key.
 
-        If the key is missing, return the default. Without a default, record a problem and return
-        None.
+        Without a default, record a problem for a missing key and return None.
         """
         self._known.add(key)
         if key in self._data:
@@ -144,7 +144,8 @@ class TableReader:
         return _stand_in(kind) if default is _REQUIRED else default
 
     def number(self, key: str, allowed: Range, default: float | None = None) -> float:
-        """Read a number within a range. Without a default a missing key is a problem."""
+        """Read the number at a key within the range `allowed`. Without a default a missing key is a
+        problem."""
         found: float = self.value(
             key, Annotated[float, allowed], _REQUIRED if default is None else default
         )
@@ -176,12 +177,14 @@ class TableReader:
         return found
 
     def choice(self, key: str, allowed: Sequence[str], default: str | None = None) -> str:
-        """Read one of the allowed words; '' after a problem."""
+        """Read the text at a key, one of the words `allowed`; '' after a problem, `default` if it
+        is missing."""
         usual = _REQUIRED if default is None else default
         return str(self.value(key, Literal[tuple(allowed)], usual))
 
     def text(self, key: str, default: str | None = None) -> str:
-        """Read a printable, non-empty, single-line text; '' after a problem."""
+        """Read the printable, non-empty, single-line text at a key; '' after a problem, `default`
+        if missing."""
         return str(self.value(key, Label, _REQUIRED if default is None else default))
 
     def texts(self, key: str, meaning: str) -> tuple[str, ...]:
@@ -326,7 +329,15 @@ def checked(kind: Any, value: Any, path: str, problems: Problems) -> Any:
 
 
 def _single(kind: Any, marks: Sequence[Any], value: Any, path: str, problems: Problems) -> Any:
-    """Return a checked number, text, word of a list, or boolean."""
+    """Return a number, text, word of a list, or boolean; after a problem a valid placeholder.
+
+    Args:
+        kind: type that is allowed.
+        marks: further annotations, such as a `Range`.
+        value: the value in the document.
+        path: key path of the value.
+        problems: collector of problems.
+    """
     ranges = [mark for mark in marks if isinstance(mark, Range)]
     if kind is float:
         return checked_number(value, ranges[0] if ranges else ANY_NUMBER, path, problems)
@@ -358,7 +369,8 @@ def _single(kind: Any, marks: Sequence[Any], value: Any, path: str, problems: Pr
 
 
 def _stand_in(kind: Any, marks: Sequence[Any] = ()) -> Any:
-    """Return a valid placeholder for a wrong or missing value."""
+    """Return a valid placeholder of a type for a wrong or missing value; `marks` are the
+    annotations."""
     if get_origin(kind) is Annotated:
         kind, *marks = get_args(kind)
     for mark in marks:
@@ -426,9 +438,16 @@ def checked_vector(
 def _array(
     shape: Shape, marks: Sequence[Any], value: Any, path: str, problems: Problems
 ) -> np.ndarray[Any, Any]:
-    """Return a value as a read-only array of finite numbers, checked against an annotation.
+    """Return a value as a read-only array of finite numbers; after a problem a valid placeholder.
 
-    NaN is accepted if the annotation allows missing entries.
+    NaN is accepted if the annotations allow missing entries.
+
+    Args:
+        shape: shape that is allowed.
+        marks: further annotations, such as a `Range`.
+        value: the value in the document.
+        path: key path of the value.
+        problems: collector of problems.
     """
     for mark in marks:
         if isinstance(mark, Range):
@@ -470,9 +489,8 @@ SHAPES = {"box": Box, "cylinder": Cylinder, "sphere": Sphere, "mesh": Mesh}
 
 
 def read_pose(table: TableReader, key: str) -> Array:
-    """Read a pose (4, 4), read-only, from a sub-table with xyz [m] and rpy [rad], both zero by
-    default.
-    """
+    """Read a pose (4, 4), read-only, from the sub-table at `key` with xyz [m] and rpy [rad], zero
+    by default."""
     inner = table.table(key)
     pose = _xyz_rpy(inner)
     inner.close()

@@ -123,10 +123,7 @@ def _known_allocation(table: TableReader, key: str, usual: str) -> str:
 
 
 def _check_vectors(task: Task, problems: Problems) -> None:
-    """Check that every allowed rotation vector is shorter than `MOST_TURN`.
-
-    At a full turn the map from vectors to rotations is singular.
-    """
+    """Record a problem unless every allowed rotation vector is shorter than `MOST_TURN` [rad]."""
     for k, waypoint in enumerate(task.waypoints):
         farthest = np.maximum(np.abs(waypoint.lower[3:]), np.abs(waypoint.upper[3:]))
         if np.linalg.norm(farthest) > MOST_TURN:
@@ -165,7 +162,8 @@ def _orientation(table: TableReader) -> Orientation:
 
 
 def _force_limit(table: TableReader) -> tuple[float, float]:
-    """Read the bounds of the force limit. The upper bound is infinite if the file has none."""
+    """Read the lower and upper bound of the force limit [N]; the upper is infinite if not
+    stated."""
     if not table.has("force_limit"):
         return (0.0, np.inf)
     low, high = table.vector("force_limit", (quantity.FORCE,) * 2)
@@ -488,9 +486,8 @@ class _Chain:
         return J
 
     def error(self, q: Array, pose: Array) -> Array:
-        """Compute the error (6,) of the flange at joints q from its placement for a box pose [m,
-        rad].
-        """
+        """Compute the error (6,) [m, rad] of the flange at joints q from its place for the box at
+        `pose` (6,)."""
         T = self.to_root @ box_placement(self.orientation, pose) @ self.T_box_flange
         pin.framesForwardKinematics(self.model, self.data, q)
         here = self.data.oMf[self.flange]
@@ -498,9 +495,8 @@ class _Chain:
         return np.concatenate([T[:3, 3] - here.translation, turn])
 
     def reach(self, q: Array, pose: Array) -> Array | None:
-        """Find joints near q that hold the box at a pose (6,), within the limits; None if none is
-        found.
-        """
+        """Find joints (n,) near q that hold the box at a pose (6,) within the limits; None if not
+        found."""
         for _ in range(MAX_NEWTON_STEPS):
             error = self.error(q, pose)
             if np.linalg.norm(error) < CLOSE and self.within(q):
@@ -518,7 +514,8 @@ class _Chain:
         return bool(np.all((q >= self.robot.position_lower) & (q <= self.robot.position_upper)))
 
     def starts(self) -> Array:
-        """Return start postures: the middle of the limits, then random ones."""
+        """Return start postures (k, joints): the middle of the limits, then random ones
+        [rad or m]."""
         rng = np.random.default_rng(0)
         q = np.vstack([self.middle, rng.uniform(self.low, self.high, (SEEDS, len(self.low)))])
         for joint, value in self.held.items():

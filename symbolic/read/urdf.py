@@ -106,13 +106,13 @@ class Urdf:
 
     @property
     def collision_meshes(self) -> tuple[str, ...]:
-        """Addresses of collision meshes as written, each once."""
+        """Addresses of the collision meshes as written in the file, each once."""
         shapes = (shape.shape for found in self.collisions.values() for shape in found)
         return tuple(dict.fromkeys(s.address for s in shapes if isinstance(s, UrdfMesh)))
 
     @property
     def visual_meshes(self) -> tuple[str, ...]:
-        """Addresses of visual meshes as written, each once."""
+        """Addresses of the visual meshes as written in the file, each once."""
         return tuple(dict.fromkeys(mesh for found in self.visuals.values() for mesh in found))
 
 

@@ -92,8 +92,11 @@ def _array_head(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
 
 @cache
 def _record(kind: Hashable) -> tuple[bytes, tuple[str, ...]]:
-    """Return the bytes that begin a record's content, and the names of the record's fields that
-    belong to it."""
+    """Return what all records of a class have in common for their content.
+
+    Returns:
+        The bytes with which the content begins, and the names of the fields that belong to it.
+    """
     own: Any = kind
     names = (each.name for each in fields(own))
     kept = tuple(name for name in names if name not in ("source", "reading", "text"))

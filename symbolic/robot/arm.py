@@ -372,6 +372,11 @@ def posture_function(robots: Arms, models: Models, contacts: Contacts) -> ca.Fun
     Inputs: pose (6,) of the box [m, rad]; guess_1, guess_2 (n,), nearby joint positions [rad]. The
     guess sets the redundant joints. Outputs: q_1, q_2 (n,) after `IK_NEWTON_STEPS` [rad];
     residual_1, residual_2, the pose residuals of q_1 and q_2 [m, rad].
+
+    Args:
+        robots: descriptions of both arms.
+        models: models of both arms.
+        contacts: contacts of both arms with the box.
     """
     pose = ca.SX.sym("pose", 6)
     guesses = [ca.SX.sym(f"guess_{i + 1}", model.n_joints) for i, model in enumerate(models)]
@@ -497,7 +502,8 @@ def _independent_axes(model: RobotModel) -> tuple[int, ...]:
 
 
 def following_columns(model: RobotModel, jacobian: ca.SX) -> ca.SX:
-    """Return the columns (6, 6) of a Jacobian (6, n) for the six joints that follow the box."""
+    """Return the columns (6, 6) of a Jacobian (6, n) for the six joints of the model that follow
+    the box."""
     return jacobian[:, list(model.following)] if model.redundant else jacobian
 
 

@@ -177,7 +177,8 @@ class Clearance(PathConstraint):
         return f"clearance_{self.column}"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Build the expression of the lower bound of the distance [m]. `numbers` is empty."""
+        """Build the expression of the lower bound of the distance [m] at the symbols `place` of one
+        point of the path. `numbers` is empty."""
         return place.scene.bound(self.column)
 
     def arms(self, model: CellBodies) -> tuple[int, ...]:
@@ -263,8 +264,9 @@ class ManipulabilityLimit(PathConstraint):
         return f"reach_{self.arm + 1}"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Build the expression of the value, dimensionless; it is zero at the least manipulability
-        that the workcell allows. `numbers` is empty."""
+        """Build the expression of the value, dimensionless, at the symbols `place` of one point of
+        the path; it is zero at the least manipulability that the workcell allows. `numbers` is
+        empty."""
         least = place.model.workcell.robots[self.arm].min_manipulability
         model = place.model.robots[self.arm]
         jacobian = following_columns(model, model.jacobian(place.q[self.arm]))
