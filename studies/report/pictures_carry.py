@@ -214,12 +214,8 @@ def residual_moments(data: ReportData) -> Figure:
 
 
 def robust_price(data: ReportData, price: RobustPrice) -> Figure:
-    """Draw the peak normal forces of the recommended carry against the multiple of the uncertainty.
-
-    Args:
-        data: what the report shows.
-        price: the forces for each multiple.
-    """
+    """Draw the peak normal forces of the recommended carry against the multiple of the
+    uncertainty."""
     figure = new_figure(0.5)
     axes = figure.subplots()
     for i, robot in enumerate(data.workcell.robots):

@@ -192,16 +192,9 @@ def _zoom(axes: Axes, data: ReportData, sets: Sequence[Array]) -> None:
 
 
 def duration_against_force(data: ReportData, choice: StoredRecommendation) -> Figure:
-    """Draw the shortest drivable durations with at most a commanded force, for all cases of the
-    uncertainty.
-
-    One curve is drawn per single path, and one for all paths that the recommended carry was chosen
-    from. Limits on jerk hold only for the star.
-
-    Args:
-        data: what the report shows.
-        choice: the recommendation with its curves.
-    """
+    """Draw the shortest drivable durations with at most a commanded force, held in every case of
+    the uncertainty: one curve for each single path, and one for all paths that the recommended
+    carry was chosen from. Limits on jerk hold only for the star."""
     figure = new_figure(0.5)
     axes = figure.subplots()
     force, looks = np.array(choice.durations.forces), {RECOMMENDED_LABEL: RECOMMENDED_STYLE}
