@@ -46,11 +46,11 @@ Verdict = Literal["inside", "better", "worse"]
 
 @dataclass(frozen=True)
 class Band:
-    """Average figures of a correct MOPSO, see `BAND_SOURCE`.
+    """Published mean figures of a correct MOPSO on one problem, see `BAND_SOURCE`.
 
     Attributes:
         hypervolume, igd: means over `BAND_SEEDS` seeds.
-        igd_std: standard deviation of the IGD over seeds, where known.
+        igd_std: standard deviation of the IGD over the seeds; None if not published.
     """
 
     hypervolume: float
@@ -88,12 +88,17 @@ BANDS: dict[tuple[str, int], Band] = {
 def judge(
     ours: Summary, reference: float, *, higher_is_better: bool, std: float | None = None
 ) -> Verdict | None:
-    """Compare the mean of our figure with that of a reference band: 'inside' if they differ by at
-    most three standard errors of the difference of both means, else 'better' or 'worse'. Where the
-    reference's spread is unknown, ours is used.
+    """Compare the mean of a figure of this project with the mean of a published band.
+
+    Args:
+        ours: summary of this project's figure over seeds.
+        reference: published mean.
+        higher_is_better: True if a larger figure is better, as for the hypervolume.
+        std: published standard deviation; None to use the standard deviation of `ours`.
 
     Returns:
-        The verdict; None with fewer than two seeds, because the spread is then unknown.
+        'inside' if the means differ by at most three standard errors of their difference, else
+        'better' or 'worse'; None with fewer than two seeds.
     """
     if ours.count < 2:
         return None
@@ -107,14 +112,19 @@ def judge(
 
 @dataclass(frozen=True)
 class Score:
-    """One algorithm on one problem with one budget, over all seeds.
+    """Figures of one algorithm on one problem with one budget, over all seeds.
 
     Attributes:
-        hypervolume, igd: of the algorithm's final front, of limited size.
-        archive_hypervolume, archive_igd: of all non-dominated points that it evaluated.
+        problem, algorithm: names of problem and algorithm.
+        evaluations: budget of evaluations.
+        population: size of the population.
+        hypervolume, igd: indicators of the algorithm's final front, which has limited size.
+        archive_hypervolume, archive_igd: indicators of all non-dominated points that the algorithm
+            evaluated.
         overhead_us: the algorithm's own time per evaluation [us].
-        infeasible_in_front: members of final fronts that violate a constraint.
-        hypervolume_verdict, igd_verdict: against the band, None without one.
+        infeasible_in_front: number of members of final fronts that violate a constraint.
+        hypervolume_verdict, igd_verdict: verdicts of `judge` against the published band; None if
+            there is no band.
     """
 
     problem: str
@@ -201,8 +211,14 @@ def _score(
 
 @dataclass(frozen=True)
 class AlgorithmTest:
-    """All scores, and the rank tests of the first algorithm against each other one on the
-    problem with its optimum inside the bounds (hypervolume, then IGD; Holm-corrected)."""
+    """Result of a comparison of algorithms on test problems.
+
+    Attributes:
+        seeds: number of seeds.
+        scores: figures of every algorithm, problem and budget.
+        tests: rank tests between the first algorithm and each other one on `ShiftedZdt1`, first of
+            the hypervolume, then of the IGD; p-values corrected by Holm's method.
+    """
 
     seeds: int
     scores: tuple[Score, ...]
@@ -220,6 +236,14 @@ def compare(
     """Run every algorithm on every problem with every budget and seeds 0, 1, ...
 
     The problem with its optimum inside the bounds has its own budget and population.
+
+    Args:
+        problems: names of the problems.
+        budgets: numbers of evaluations.
+        names: names of the algorithms.
+        seeds: number of seeds.
+        population: size of the population.
+        progress: True to print the progress.
 
     Raises:
         SettingsError: unknown names, no seeds, or a budget below the population.
@@ -371,11 +395,11 @@ class AnalyticProblem:
     """A test problem and its true front.
 
     Attributes:
-        name: as in `PROBLEMS`.
-        problem: for pymoo.
-        front: (n, 2) reference front, evenly spaced.
-        ideal, nadir: (2,) least and greatest value of each objective on the front; they
-            normalise objectives for hypervolume and IGD.
+        name: name of the problem, as in `PROBLEMS`.
+        problem: the problem as an object of pymoo.
+        front: (n, 2) objectives of the reference front, evenly spaced.
+        ideal, nadir: (2,) least and greatest value of each objective on the front; they normalise
+            objectives for hypervolume and IGD.
     """
 
     name: str
@@ -385,7 +409,7 @@ class AnalyticProblem:
     nadir: Array
 
     def normalise(self, objectives: Array) -> Array:
-        """Map the front's range onto the unit square."""
+        """Scale objectives (n, 2) such that the range of the front becomes the unit square."""
         return normalise(objectives, self.ideal, self.nadir)
 
 
@@ -446,8 +470,11 @@ def _tnk_front() -> Array:
 
 
 def _srn_front() -> Array:
-    """Sample the reference front of SRN: from the point nearest to (2, 1) on the line, up x1 =
-    -2.5, then along the circle."""
+    """Sample the reference front (k, 2) of the test problem SRN.
+
+    Its decision variables run from the point nearest to (2, 1) on the constraint's line, up x1 =
+    -2.5, then along the constraint's circle.
+    """
     line_x2 = np.linspace(2.5, 3.7, _DENSE)
     line = np.column_stack([3.0 * line_x2 - 10.0, line_x2])
     column_x2 = np.linspace(2.5, np.sqrt(225.0 - 2.5**2), _DENSE)

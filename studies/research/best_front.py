@@ -43,12 +43,12 @@ ATTEMPTS_PER_START = 7
 
 @dataclass(frozen=True)
 class ReferenceFront:
-    """A reference front; arrays are read-only.
+    """The best known front of a workcell; arrays are read-only.
 
     Attributes:
-        digest: of the workcell that it belongs to.
-        objectives: (k, 2) by increasing first objective.
-        x: (k, n_var) decision vectors.
+        digest: digest of the workcell.
+        objectives: (k, 2) objectives of the k points, by increasing first objective.
+        x: (k, n_var) decision vectors of the points.
     """
 
     digest: str
@@ -139,10 +139,10 @@ def encode(front: ReferenceFront, command: str) -> bytes:
 
 
 def read_reference_front(path: Path) -> ReferenceFront:
-    """Read a file of `encode`.
+    """Read a reference front from a file that contains the result of `encode`.
 
     Raises:
-        ResultsError: it cannot be read or is damaged.
+        ResultsError: the file cannot be read or is damaged.
     """
     try:
         content = read_bytes(path)
@@ -166,7 +166,7 @@ def read_reference_front(path: Path) -> ReferenceFront:
 
 
 def reference_front(options: argparse.Namespace) -> int:
-    """Compute and write the front that the options ask for; returns the exit code."""
+    """Compute and write the reference front that the options request. Return the exit code."""
     command = (
         f"python -m studies.research.reference_front {options.workcell} --output FILE "
         f"--starts {options.starts} --attempts {options.attempts} --seed {options.seed}"

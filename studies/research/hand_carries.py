@@ -54,16 +54,18 @@ ROUGH = 1e6
 
 @dataclass(frozen=True)
 class HandThreshold:
-    """Result of the simulator for one carry.
+    """Result of the simulator for one carry of a payload in hands.
 
     Attributes:
         kind: kind of the hands, one of `KINDS`.
         hands: number of hands.
-        swings: number of natural oscillations of the payload on its layers during the carry.
+        swings: number of natural oscillations of the payload on its elastic layers during the
+            carry.
         needed: holding force that the contact model requires [N].
-        rims: share of it that the model requires if nothing can slide.
-        ratio: least holding force that suffices in the simulator, over the required one.
-        lifts: True if a rim lifts below that force, False if a hand slips.
+        rims: share of `needed` that would suffice if nothing could slide, so that only rims lift
+            off.
+        ratio: least holding force that suffices in the simulator, over `needed`.
+        lifts: True if a rim lifts off below that force, False if a hand slips.
     """
 
     kind: str
@@ -105,7 +107,8 @@ def needed_force(carry: Carry) -> float:
 
 
 def rims_share(carry: Carry) -> float:
-    """Compute the share of the needed force with which no rim lifts, if nothing can slide."""
+    """Compute the share of the needed holding force with which no rim lifts off, if nothing can
+    slide."""
     first, second = (_rough(contact) for contact in carry.workcell.contacts)
     rough = replace(carry, workcell=replace(carry.workcell, contacts=(first, second)))
     return needed_force(rough) / needed_force(carry)
@@ -262,8 +265,11 @@ def _draw_cell(kind: str, rng: np.random.Generator) -> Workcell:
 
 
 def _axes(normal: Array) -> Array:
-    """Return axes (3, 3) as columns with z along a normal and x along the payload's x axis, which
-    must be perpendicular to it."""
+    """Return a rotation (3, 3) whose columns are axes: z along a normal (3,), x along the payload's
+    x axis.
+
+    The normal must be perpendicular to the payload's x axis.
+    """
     x = np.array([1.0, 0.0, 0.0])
     return np.column_stack([x, np.cross(normal, x), normal])
 
@@ -279,7 +285,7 @@ def summary(found: Sequence[HandThreshold]) -> str:
 
 
 def thresholds(options: argparse.Namespace) -> int:
-    """Print the threshold of each carry. Return the exit code."""
+    """Find and print the threshold of each random carry in the options. Return the exit code."""
     print("hands        count  swings      needed   rims   ratio  below it")
     found = []
     for k, kind in enumerate(islice(cycle(KINDS), options.carries)):

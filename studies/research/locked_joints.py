@@ -23,12 +23,12 @@ from symbolic.records import Task
 
 @dataclass(frozen=True)
 class LockedReplica:
-    """Results of one replica.
+    """Hypervolumes of one replica with free and with locked redundant joints.
 
     Attributes:
         free: hypervolume with the redundant joints free.
-        locked: hypervolumes with the joints locked, one per lock in the order of `locks`.
-        best: positions of the lock with the largest hypervolume [rad or m].
+        locked: hypervolume for each combination of locked positions, in the order of `locks`.
+        best: positions of the combination with the largest hypervolume [rad or m].
     """
 
     free: float

@@ -99,13 +99,13 @@ LIFTED = 0.015
 
 @dataclass(frozen=True)
 class LoggedCarry:
-    """A logged run in the frames of its pads.
+    """A logged run of two arms with a box, in the frames of its pads.
 
     Attributes:
-        run: with labels; without joints and moments.
-        places: pads with x along the face, y up at the start and z into the box; the box as the
-            markers tell it; readings without offset and crosstalk.
-        stated: whether the mass is stated.
+        run: the recording with its labels; joint positions and moments are missing.
+        places: poses of the pads, with x along the face, y up at the start and z into the box;
+            poses of the box by its markers; force readings without offset and crosstalk.
+        stated: True if the log states the mass of the box.
     """
 
     run: Recording
@@ -114,7 +114,7 @@ class LoggedCarry:
 
     @property
     def mass(self) -> float:
-        """Mass of the box [kg]."""
+        """Mass of the box [kg]; of the empty box if the log states none."""
         return self.run.labels.mass or EMPTY
 
 
@@ -138,7 +138,7 @@ def labelled(folder: Path) -> list[Path]:
 
 
 def read(path: Path) -> LoggedCarry:
-    """Read a run, from its file or from that of the left arm."""
+    """Read a run, from its only file or from the file of the left arm."""
     stamp = re.search(r"\d{8}-\d{6}", path.stem)
     mass = re.search(r"_([\d.]+)kg", path.stem)
     slip = SLIPS.get(stamp[0] if stamp else "")
@@ -169,7 +169,10 @@ def read(path: Path) -> LoggedCarry:
 
 
 class _Poses:
-    """Where a tool is, with its turn since the start as rotation (n, 4, 4)."""
+    """Function of a tool's poses (n, 4, 4) at n times [s], interpolated from a log.
+
+    The rotation of a pose is the tool's rotation since the start.
+    """
 
     def __init__(self, time: Array, position: Array, turn: Rotation) -> None:
         self._time, self._position, self._turn = time, position, Slerp(time, turn)
@@ -245,8 +248,11 @@ def _two_files(left: Path) -> list[_Arm]:
 
 @cache
 def _need() -> ca.Function:
-    """Return the mean normal force that holds, of force and moment about the middle of facing pads
-    along the axes of the first, half their distance and the friction."""
+    """Build the function of the mean normal force [N] with which two facing pads hold a box.
+
+    Inputs: force (3,) [N] and moment (3,) [N m] about the middle of the pads, along the axes of the
+    first pad; half the distance of the pads [m]; friction coefficient.
+    """
     force, moment = ca.SX.sym("force", 3), ca.SX.sym("moment", 3)
     half, friction = ca.SX.sym("half"), ca.SX.sym("friction")
     patch = SoftPatch(2.0 / 3.0 * PATCH, PATCH * np.eye(2))
@@ -260,18 +266,21 @@ def _need() -> ca.Function:
 
 @dataclass(frozen=True)
 class Comparison:
-    """A carry beside the model, at n samples from when the box is lifted until it is set down or
-    lost.
+    """Measured forces of a carry beside the forces of the model, at n samples.
+
+    The samples begin when the box is lifted and end when it is set down or lost.
 
     Attributes:
-        time: (n,) [s].
-        squeeze: (n,) mean of both normal forces [N].
-        need: (n, 2) the motion asks for, by either end of `STATED_FRICTION` [N].
-        used: (n,) tangential over normal forces, as they were measured: the arms work against one
-            another along the faces, too.
-        slid: (n,) how far the box is below where it was between the pads, by the markers [m]; not
-            finite where they were hardly seen, neither is the next.
-        lean: (n,) of the box from how it stood [rad].
+        time: (n,) times [s].
+        squeeze: (n,) measured normal force, mean of both pads [N].
+        need: (n, 2) normal force that the motion requires by the model [N], for the lower and the
+            upper friction coefficient of `STATED_FRICTION`.
+        used: (n,) measured tangential over measured normal force. It includes the force with which
+            the arms push against each other along the faces.
+        slid: (n,) distance by which the box has slid down between the pads, by its markers [m]; NaN
+            if the markers were hardly seen.
+        lean: (n,) angle by which the box has tilted since the start, by its markers [rad]; NaN if
+            the markers were hardly seen.
     """
 
     time: Array
@@ -283,12 +292,12 @@ class Comparison:
 
     @property
     def margin(self) -> Array:
-        """(n,) squeeze over need, at the lower end of the bracket."""
+        """(n,) measured over required normal force, for the lower friction coefficient."""
         return np.asarray(self.squeeze / self.need[:, 0])
 
 
 def compared(carry: LoggedCarry) -> Comparison:
-    """Compute the model's forces in a logged carry."""
+    """Compare the measured forces of a logged carry with the forces of the model."""
     run, places = carry.run, carry.places
     time = np.arange(run.time[0], run.time[-1], STEP)
     near = np.searchsorted(run.time, time).clip(0, len(run.time) - 1)
@@ -335,8 +344,13 @@ def compared(carry: LoggedCarry) -> Comparison:
 
 
 def _by_markers(places: Places) -> tuple[Array, Array]:
-    """Compute how far (n,) a box's upright axis has leant since the start [rad], and the samples
-    (n,) at which its markers are valid: it leans little and stands between the pads."""
+    """Compute how far a box has tilted, and at which samples its markers are valid.
+
+    They are valid while the box tilts little and stays between the pads.
+
+    Returns:
+        (n,) angle of the box's upright axis from its start [rad], and (n,) booleans.
+    """
     start = Rotation.from_matrix(places.box[: 2 * GLITCH, :3, :3]).mean()
     up = (Rotation.from_matrix(places.box[:, :3, :3]) * start.inv()).as_matrix()[:, 2, 2]
     lean = np.arccos(np.clip(up, -1.0, 1.0))
@@ -364,8 +378,10 @@ CREPT = 0.025
 
 
 def table(folder: Path) -> Table:
-    """Return every labelled run at its least margin, those that lost their box when they did; the
-    largest friction used, slide and lean until then.
+    """Return a table with a row for every labelled run.
+
+    A row states the forces at the sample with the least margin, or when the box was lost, and the
+    largest friction used, slide and tilt until then.
 
     Raises:
         SettingsError: there are no logs.

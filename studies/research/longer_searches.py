@@ -33,15 +33,17 @@ from studies.study.summary import CampaignSummary, read_summary
 
 @dataclass(frozen=True)
 class LongerSearch:
-    """One algorithm's replicas beside a longer search of the same algorithm or of another.
+    """Comparison of one algorithm's polished fronts with longer searches of the same or another
+    algorithm.
 
     Attributes:
-        algorithm: whose polished fronts are compared.
-        rival: the algorithm that searches longer.
-        evaluations: its budget.
-        polished_wins: replicas in which the polished front has the larger hypervolume.
-        replicas: all of them.
-        search, polished, longer: median hypervolumes.
+        algorithm: algorithm whose polished fronts are compared.
+        rival: algorithm that searches longer.
+        evaluations: budget of the longer search.
+        polished_wins: number of replicas in which the polished front has the larger hypervolume.
+        replicas: number of replicas.
+        search, polished, longer: median hypervolumes of the algorithm's searched and polished
+            fronts, and of the longer searches.
     """
 
     algorithm: str
@@ -154,9 +156,11 @@ class PolishGap:
     """Distance of one algorithm's fronts from a reference front, medians over the replicas.
 
     Attributes:
-        algorithm: its name.
-        search_gap, polished_gap: the reference's hypervolume less the front's.
-        search_igd, polished_igd: mean distances of the reference's points to the front.
+        algorithm: name of the algorithm.
+        search_gap, polished_gap: hypervolume of the reference front minus the hypervolume of the
+            searched and of the polished front.
+        search_igd, polished_igd: mean distance of the reference front's points from the searched
+            and from the polished front.
         closed: share of the gap that the polish closes [%].
     """
 
@@ -245,7 +249,8 @@ def as_text(found: Sequence[LongerSearch]) -> str:
 
 
 def control(options: argparse.Namespace) -> int:
-    """Hold the study of the options against longer searches; returns the exit code."""
+    """Compare the study in the options with longer searches or a reference front. Return the exit
+    code."""
     found: Sequence[LongerSearch | PolishGap]
     if options.reference is not None:
         found = near = approaches(options.results, read_reference_front(options.reference))

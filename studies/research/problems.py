@@ -25,18 +25,18 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ProblemAttempt:
-    """Result of one proposal.
+    """Result of one proposal for a problem file.
 
     Attributes:
-        problem, seed: name of the problem and seed.
-        problem_met: why there is no carry, '' if there is one.
+        problem, seed: name of the problem, and seed of the random numbers.
+        problem_met: reason why there is no carry, '' if there is one.
         certified: core-seconds to the first certified carry, without imports.
         seconds: core-seconds of the whole proposal.
         length: length of the joint path, all joints together [rad].
         passes: obstacles that the carry passes, and on which side.
         duration: duration of the recommended carry [s].
         force: larger commanded force of both arms [N].
-        allowed: True if this force is within the reference force in every case.
+        allowed: True if `force` is within the reference force in every case of the uncertainty.
     """
 
     problem: str

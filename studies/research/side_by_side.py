@@ -29,14 +29,15 @@ EVALUATIONS = 400
 def compare(
     cells: Sequence[Cell], batches: int, repeats: int, seed: int = 0
 ) -> list[dict[str, Any]]:
-    """Measure the compiled evaluation of several cells, collisions included, in the thread's own
-    time.
+    """Measure the compiled evaluation of several cells in turns, collisions included.
+
+    Times are the thread's own times.
 
     Args:
         cells: the cells.
         batches: number of batches near the hand-made path, and of random ones, per cell.
         repeats: number of rounds with each batch.
-        seed: of candidates and searches.
+        seed: seed of candidates and searches.
 
     Returns:
         For each cell the numbers of bodies, pieces, hulls and pairs; milliseconds per candidate
@@ -88,7 +89,12 @@ def _candidates(cell: Cell, what: str, batches: int, rng: np.random.Generator) -
 
 
 def _search_seconds(cell: Cell, seed: int) -> float:
-    """Return the core-seconds of a drivable search with functions that are already compiled."""
+    """Measure the core-seconds of a search for drivable carries, with functions compiled before.
+
+    Args:
+        cell: the cell.
+        seed: seed of the search.
+    """
     drivable = cell.drivable()
     drivable.evaluate(drivable.initial)
     start = time.process_time()

@@ -66,16 +66,18 @@ SAME_PLACE = 0.1
 
 @dataclass(frozen=True)
 class Slip:
-    """What the simulator says of one carry.
+    """Result of the simulator for one carry.
 
     Attributes:
-        cell, candidate, friction: which one, and what it was pressed for.
-        pads: a key of `ALLOWED`.
-        duration, force: of the carry [s], and the largest planned normal force of pad 2 [N].
-        threshold: least multiple of the planned force that holds; NaN where there is none.
-        begins: when the box slips first under a force that is the same all along and a little
-            below what holds, see `first_slip` [s]; NaN where it does not.
-        planned: when the plan first asks for more than that [s].
+        cell, candidate: name of the cell and kind of the candidate.
+        friction: friction coefficient for which the forces are planned.
+        pads: kind of the pads, a key of `ALLOWED`.
+        duration: duration of the carry [s].
+        force: largest planned normal force of pad 2 [N].
+        threshold: least multiple of the planned force that holds the box; NaN if there is none.
+        begins: time at which the box slips first under a constant force a little below the least
+            that holds [s], see `first_slip`; NaN if it does not slip.
+        planned: time at which the planned force first exceeds nearly its largest value [s].
     """
 
     cell: str
@@ -90,12 +92,12 @@ class Slip:
 
     @property
     def within(self) -> bool:
-        """True if the threshold is within its bounds about one."""
+        """True if the threshold differs from 1 by at most the tolerance in `ALLOWED`."""
         return abs(self.threshold - 1.0) <= ALLOWED[self.pads]
 
     @property
     def in_place(self) -> bool:
-        """True if the box slips first where the planned force is largest."""
+        """True if the box first slips at about the time at which the planned force is largest."""
         return abs(self.begins - self.planned) <= SAME_PLACE
 
     def __str__(self) -> str:
@@ -107,8 +109,13 @@ class Slip:
 
 @dataclass(frozen=True)
 class Slips:
-    """The file of all carries so far, in order, the seed that they are drawn with, and their pads'
-    layer [N/m^3]."""
+    """Results of all carries so far, as stored in a file.
+
+    Attributes:
+        seed: seed with which the carries are drawn.
+        layer: stiffness of the pads' elastic layers [N/m^3].
+        found: result of each carry, in order.
+    """
 
     seed: int
     layer: float
@@ -116,7 +123,8 @@ class Slips:
 
 
 def thresholds(options: argparse.Namespace) -> int:
-    """Print and store the threshold of every carry that is asked for; returns the exit code."""
+    """Find, print and store the threshold of every carry that the options request. Return the exit
+    code."""
     path, done = options.output, Slips(options.seed, options.layer, ())
     if path.exists():
         done = read_record(Slips, path, "delete it to begin anew")
@@ -144,7 +152,7 @@ def thresholds(options: argparse.Namespace) -> int:
 
 
 def summary(found: Sequence[Slip]) -> str:
-    """Count how many carries are as they should be."""
+    """Return lines of text on how many carries have a threshold near 1, and slip where planned."""
     lines = []
     for pads, allowed in ALLOWED.items():
         some = np.array([slip.threshold for slip in found if slip.pads == pads])
@@ -221,14 +229,15 @@ def first_slip(lacks: Outcome, held: Outcome) -> float:
 
 
 def pads_of(workcell: Workcell) -> str:
-    """Return a key of `ALLOWED`."""
+    """Return the kind of a cell's pads, a key of `ALLOWED`: 'fork', 'rectangle' or 'disc'."""
     if len(workcell.pads) > 2:
         return "fork"
     return "rectangle" if any(pad.half_sides for pad in workcell.pads) else "disc"
 
 
 class _Source:
-    """Carries of one cell; every one is the same whichever are asked for."""
+    """Source of the carries of one cell; carry number k does not depend on the carries drawn
+    before."""
 
     def __init__(self, path: Path, seed: int) -> None:
         self._drivable = cell = Cell.load(path).drivable()  # its files last as long as it

@@ -76,7 +76,9 @@ def _seconds(evaluate: Evaluate, x: Array, first: int, count: int) -> float:
 def summary(
     times: Mapping[str, Array], average: Callable[[Array], np.floating] = np.median
 ) -> dict[str, float]:
-    """Return the average time of each way [ms], and the averages of the ratios within a round.
+    """Return the average time of each way of evaluation [ms], and its average ratio to 'compiled'.
+
+    A ratio is taken within a round. The keys end with `_ms` and `_over_compiled`.
 
     Args:
         times: seconds per candidate (rounds,) of 'compiled', 'interpreted' and 'plain'.
@@ -120,8 +122,11 @@ DUAL_ARM_EXPORT double dual_arm_peak(long long rounds) {
 
 
 def peak_operations() -> float | None:
-    """Measure the additions and multiplications per second of one core in lanes: the best of
-    several runs of a loop with sixteen independent chains. None without lanes."""
+    """Measure how many additions and multiplications one core makes per second in lanes.
+
+    The result is the best of several runs of a loop with sixteen independent sequences of
+    operations; None on a machine without lanes.
+    """
     library = load_or_build_program("peak", "peak", dict, _LOOP)
     if library.dual_arm_lanes() < 2:
         return None
@@ -218,13 +223,16 @@ def with_collisions(
 
 
 def shares(evaluator: CandidateEvaluator, batches: Array, repeats: int) -> dict[str, float]:
-    """Measure the shares of the time of the compiled evaluation: 'candidate' is path, arms, forces
-    and objectives; 'collisions' is bounds, proofs and FCL.
+    """Measure the shares of two parts of the compiled evaluation in its time.
 
     Args:
         evaluator: evaluator of the cell.
         batches: (n, size, n_var) candidates.
         repeats: number of rounds with each batch.
+
+    Returns:
+        Shares by name: 'candidate' for path, arms, forces and objectives; 'collisions' for bounds,
+            proofs and FCL.
     """
     ways: dict[str, Evaluate] = {
         "whole": evaluator.evaluate,

@@ -65,11 +65,11 @@ BAXTER_NOTE = (
 
 
 def source(count: int, seed: int) -> BenchmarkSource:
-    """Return the benchmark of a random sample of the scenes.
+    """Return the source of a benchmark with a random sample of the published scenes.
 
     Args:
         count: number of scenes of each kind.
-        seed: of the sample.
+        seed: seed of the sample.
     """
 
     def benchmark(there: Path) -> Benchmark:
@@ -93,8 +93,11 @@ class Hands:
         self._data = self._model.createData()
 
     def at(self, joints: dict[str, float]) -> tuple[Array, Array]:
-        """Return the positions (3,) of the left and the right hand at joint positions by name
-        [m]."""
+        """Return the positions (3,) [m] of the left and the right hand in the robot's root.
+
+        Args:
+            joints: joint positions [rad] by name; other joints are at their neutral position.
+        """
         q = pin.neutral(self._model)
         for name, value in joints.items():
             if self._model.existJointName(name):
@@ -106,8 +109,10 @@ class Hands:
 
 
 def request(path: Path) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the joint positions by name in which both arms begin, and in which they end, from a
-    scene's request file.
+    """Read the first and the last posture of both arms from a scene's request file.
+
+    Returns:
+        Joint positions [rad] by name, first at the beginning, then at the end.
 
     Raises:
         OutsideError: the file is not such a request.

@@ -42,7 +42,7 @@ MACHINES_NOTE = "Nothing was published: the makers plan for each arm by itself."
 
 
 def benchmark(folder: Path) -> Benchmark:
-    """Return the benchmark of the machines in the subfolders of `folder`."""
+    """Return the benchmark of the machines whose files are in the subfolders of `folder`."""
     for file in (UR10E, PANDAS):
         if not (folder / file).is_file():
             raise OutsideError(f"{file} is not there")
@@ -98,7 +98,11 @@ def _two_pandas(xacro: Path) -> BenchmarkTask:
 
 
 def _pad(radius: float) -> dict[str, Any]:
-    """Return the contact of a round pad of this radius [m] on a rod in front of the flange."""
+    """Return keys of a robot in a workcell file: a round pad on a rod in front of the flange.
+
+    Args:
+        radius: radius of the rod and of the pad [m].
+    """
     rod = {
         "kind": "cylinder",
         "radius": radius,

@@ -50,12 +50,12 @@ class BenchmarkTask:
     """One carry of a benchmark.
 
     Attributes:
-        name: of the task, in the table and in file names.
+        name: name of the task, in the table and in file names.
         problem: tables of the problem file.
-        length: length of the published shortest carry [rad], None where none was published.
+        length: length of the published shortest carry [rad], None if none was published.
         straight: straight distance between the published first and last postures, in the published
             coordinates [rad].
-        seconds: duration of the published fastest carry [s], None where none was published.
+        seconds: duration of the published fastest carry [s], None if none was published.
     """
 
     name: str
@@ -70,12 +70,12 @@ class Benchmark:
     """A set of published tasks.
 
     Attributes:
-        name: on the command line.
-        title: in the table.
-        tasks: the carries.
-        note: what else was published, and what cannot be compared.
+        name: name on the command line.
+        title: title of the table.
+        tasks: the tasks.
+        note: text on what else was published, and what cannot be compared.
         coordinates: function from the joints (n, joints) of both arms to the published coordinates
-            (n, m) [rad]; None if these are all joints.
+            (n, m) [rad]; by default all joints of both arms.
     """
 
     name: str
@@ -87,7 +87,7 @@ class Benchmark:
 
 @dataclass(frozen=True)
 class BenchmarkSource:
-    """Published files, and how a benchmark is made of them.
+    """Published files, and the way in which a benchmark is made from them.
 
     Attributes:
         how: shell commands that fetch the files into FOLDER.
@@ -125,11 +125,11 @@ def carry_problem(
     """Return the tables of a problem file for a carry that begins and ends in the air.
 
     Args:
-        name: of the cell.
+        name: name of the cell.
         robots: tables `[[robots]]`.
         payload: table `[payload]`.
         pads: tables `[[contacts]]` without friction.
-        ends: start and goal pose of the box.
+        ends: start and goal pose (6,) of the box [m, rad].
         scene: tables `[[environment]]`.
         task: further keys of `[task]`.
     """
@@ -146,11 +146,11 @@ def carry_problem(
 
 @dataclass(frozen=True)
 class Length:
-    """Length of a carry; not finite without a carry.
+    """Length of the joint path of a carry; NaN without a carry.
 
     Attributes:
-        joints: over all joints of both arms [rad].
-        theirs: in the coordinates of those who published the task [rad].
+        joints: length over all joints of both arms [rad].
+        theirs: length in the coordinates of the authors who published the task [rad].
     """
 
     joints: float = math.nan
@@ -163,7 +163,7 @@ class TaskResult:
 
     Attributes:
         task: the task.
-        refused: why no carry was found, '' if one was.
+        refused: reason why no carry was found, '' if one was.
         held: True if the box can be held at start and goal.
         workcell: the proposed workcell file, None without one.
         certified, seconds: working time until the first certified carry, and until the file was

@@ -154,9 +154,13 @@ def elbow_turn(q: Array) -> float:
 
 
 def _box(model: pin.Model, q: Array) -> list[float]:
-    """Return the box pose [m, rad] at which the left arm holds the box in joint positions q.
+    """Return the box pose [x, y, z, roll, pitch, yaw] [m, rad] at which the left arm holds the box.
 
     The last link must point along y.
+
+    Args:
+        model: Pinocchio's model of the left arm.
+        q: (7,) joint positions [rad].
     """
     data = model.createData()
     pin.framesForwardKinematics(model, data, q)

@@ -104,7 +104,7 @@ def benchmark(there: Path) -> Benchmark:
 
 
 def bodies(scene: str) -> Iterator[dict[str, Any]]:
-    """Yield the fixed boxes of a published scene as bodies of a workcell.
+    """Yield the fixed boxes of a published scene as bodies of a workcell file, one dictionary each.
 
     Raises:
         OutsideError: the text is not such a scene.
@@ -128,7 +128,7 @@ def bodies(scene: str) -> Iterator[dict[str, Any]]:
 
 
 def _numbers(text: str | None) -> list[float]:
-    """Return the three numbers in an attribute's text."""
+    """Parse the three numbers in the text of an XML attribute."""
     try:
         found = [float(each) for each in (text or "").split()]
     except ValueError:

@@ -44,7 +44,8 @@ class PlainArm:
     """Numeric model of an arm that holds the box with its pad.
 
     Args:
-        robot, contact: the arm, and its contact with the box.
+        robot: description of the arm.
+        contact: contact of the arm's pad with the box.
         redundant: indices of the joints that do not follow the box.
         orientation: convention of the last three numbers of poses.
     """
@@ -68,21 +69,27 @@ class PlainArm:
         self.T_flange_pad = pin.SE3(robot.T_flange_pad)
 
     def flange_target(self, pose: Array) -> pin.SE3:
-        """Compute the flange placement in the root that puts the pad on its contact."""
+        """Compute the flange placement in the root that puts the pad on its contact, for a box pose
+        (6,)."""
         world_box = pin.SE3(box_rotation(self.orientation, pose[3:]), pose[:3])
         world_pad = world_box * pin.SE3(self.contact.T_box_pad)
         return self.T_root_world * world_pad * self.T_flange_pad.inverse()
 
     def place(self, q: Array) -> pin.SE3:
-        """Compute the flange placement in the root frame. The frames in `data` are up to date
-        afterwards."""
+        """Compute the flange placement in the root frame at joint positions q (n,).
+
+        The placements of all frames in `data` are up to date afterwards.
+        """
         pin.forwardKinematics(self.model, self.data, q)
         pin.updateFramePlacements(self.model, self.data)
         return self.data.oMf[self.flange]
 
     def jacobian(self, q: Array) -> Array:
-        """Compute the Jacobian (6, n) of the flange along the axes of the root frame, linear rows
-        first."""
+        """Compute the Jacobian (6, n) of the flange at joint positions q (n,), along the root's
+        axes.
+
+        The rows of the linear velocity come first.
+        """
         J: Array = pin.computeFrameJacobian(
             self.model, self.data, q, self.flange, pin.LOCAL_WORLD_ALIGNED
         )
@@ -126,13 +133,14 @@ class PlainArm:
     def search(
         self, previous: Array, change: Array, curve: Array, target: pin.SE3, values: Array
     ) -> Array:
-        """Return joint positions (n,) for the next target, by Newton's method from an extrapolation
-        of the previous ones.
+        """Return joint positions (n,) for the next target, by Newton's method.
+
+        The search starts at an extrapolation of the previous joint positions.
 
         Args:
             previous: (n,) previous joint positions.
-            change, curve: (n,) last difference of the joint positions, and last difference of this
-                difference.
+            change: (n,) last difference of the joint positions between samples.
+            curve: (n,) last difference of that difference.
             target: placement of the flange.
             values: positions of the redundant joints.
         """

@@ -22,13 +22,13 @@ from symbolic.robot.arm import REACH_TOLERANCE
 
 @dataclass(frozen=True)
 class PlainCandidate:
-    """Verdict of the plain reference on a candidate.
+    """Result of the plain reference code for a candidate, without collisions.
 
     Attributes:
-        outputs: every output of the symbolic evaluator by name, samples in rows.
-        violated: names of the violated constraints in the order of `CONSTRAINTS`; empty for a
-            feasible candidate.
-        reason: the constraint that is violated first along the path, or an empty string.
+        outputs: every output of the symbolic evaluator by name, one row per sample.
+        violated: names of the violated constraints in the order of `CONSTRAINTS`; () for a feasible
+            candidate.
+        reason: the constraint that is violated first along the path, or ''.
     """
 
     outputs: dict[str, Array]
@@ -37,7 +37,7 @@ class PlainCandidate:
 
 
 class PlainEvaluator:
-    """Evaluates candidates of one workcell; reads the robots' models once.
+    """Evaluator of candidates of one workcell without collisions; it reads the robots' models once.
 
     Args:
         workcell: the cell.
@@ -113,7 +113,11 @@ class PlainEvaluator:
 
 
 def _violated(constraint: Array) -> list[list[str]]:
-    """Return the names of the violated constraints of each sample, in order."""
+    """Return the names of the violated constraints of each of n samples, in order.
+
+    Args:
+        constraint: (n, constraints) values of `CONSTRAINTS`; positive values are violations.
+    """
     return [
         [name for name, value in zip(CONSTRAINTS, values, strict=True) if value > 0.0]
         for values in constraint
@@ -133,10 +137,10 @@ def evaluate(workcell: Workcell, start: tuple[Array, Array], x: Array) -> PlainC
 
 @dataclass(frozen=True)
 class PlainVerdict:
-    """Verdict of the plain reference on a candidate, collisions included.
+    """Result of the plain reference code for a candidate, collisions included.
 
     Attributes:
-        candidate: verdict without collisions.
+        candidate: result without collisions.
         collisions: collisions at the samples that both arms reach.
         objectives: (2,) peak normal forces over the reference forces.
         feasible: True if no constraint is violated and no bodies collide.
@@ -155,7 +159,7 @@ class PlainVerdict:
 
 
 class PlainJudge:
-    """The plain reference with collisions; reads robots and shapes once.
+    """Evaluator of candidates with collisions; it reads robots and shapes once.
 
     Args:
         workcell: the cell.

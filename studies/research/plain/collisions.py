@@ -55,7 +55,7 @@ class _Solid:
 
 
 class PlainCollisionChecker:
-    """FCL objects of all bodies of a workcell."""
+    """Checker of all pairs of bodies of a workcell for collisions by FCL."""
 
     def __init__(self, workcell: Workcell) -> None:
         self.workcell = workcell
@@ -72,7 +72,7 @@ class PlainCollisionChecker:
 
     @cached_property
     def pairs(self) -> tuple[tuple[str, str], ...]:
-        """Names of the bodies of all pairs that are checked."""
+        """Names of the two bodies of every pair that is checked."""
         return build_geometry(self.workcell).pair_names
 
     def check(self, time: Array, pose: Array, q_1: Array, q_2: Array) -> PlainCollisions:
@@ -110,8 +110,12 @@ class PlainCollisionChecker:
         return hit
 
     def _tolerance(self, of_payload: bool) -> float:
-        """Return the distance up to which two bodies count as colliding [m]. For the payload it
-        includes the uncertain position of the pads."""
+        """Return the distance up to which two bodies count as colliding [m].
+
+        Args:
+            of_payload: True if one body is the payload, for which the uncertain position of the
+                pads is added.
+        """
         doubt = self.workcell.uncertainty
         displaced = doubt.pad_position if of_payload and doubt.stated else 0.0
         return self.workcell.collision.tolerance + displaced
@@ -122,8 +126,12 @@ class PlainCollisionChecker:
             solid.move(world_box)
 
     def _resting_places(self) -> list[tuple[str, Array, float]]:
-        """Return every allowed contact at a fixed pose: the body, the position of the payload, and
-        the distance within which contact is allowed [m]."""
+        """Return every contact that the workcell allows at a fixed pose of the path.
+
+        Returns:
+            For each contact the name of the body, the position (3,) of the payload [m], and the
+            distance from it within which contact is allowed [m].
+        """
         task, places = self.workcell.task, []
         for waypoint in task.waypoints:
             if not waypoint.is_fixed:
@@ -137,8 +145,8 @@ class PlainCollisionChecker:
         return places
 
     def _allowed(self, centre: Array) -> set[str]:
-        """Return the names of the bodies that the payload may touch with its centre at this
-        position (3,)."""
+        """Return the names of the bodies that the payload may touch while its centre is at `centre`
+        (3,) [m]."""
         return {
             body
             for body, place, departure in self.resting
@@ -147,7 +155,7 @@ class PlainCollisionChecker:
 
 
 class _Arm:
-    """Links and tools of a robot, moved by numeric Pinocchio."""
+    """Collision shapes of a robot's links and tools, placed by Pinocchio's forward kinematics."""
 
     def __init__(self, robot: Robot) -> None:
         self.base = pin.SE3(robot.T_world_base)
@@ -180,7 +188,8 @@ class _Arm:
 
 
 def _urdf_shape(item: pin.GeometryObject) -> Shape | coal.Capsule:
-    """Convert a link's shape as Pinocchio read it to a shape of this project."""
+    """Convert the shape of a link, as Pinocchio read it, to a shape of this project or a capsule of
+    Coal."""
     shape = item.geometry
     match shape:
         case coal.Box():
@@ -195,7 +204,7 @@ def _urdf_shape(item: pin.GeometryObject) -> Shape | coal.Capsule:
 
 
 def _shrunk_solids(shape: Box | Cylinder | Mesh) -> list[_Solid]:
-    """Shrink a payload by the resting tolerance; a hull's shrinking follows from its piece."""
+    """Return a payload's shape as FCL objects, smaller by `RESTING_TOLERANCE` on every side."""
     less = 2.0 * RESTING_TOLERANCE
     match shape:
         case Box():

@@ -46,12 +46,14 @@ def redundant_path(task: Task, x: Array) -> Array:
 
 
 def natural_quintic(points: Array) -> Array:
-    """Compute coefficients (n_segments, 6 powers, dim) of the natural quintic spline through
-    points.
+    """Compute the coefficients (segments, 6, n) of the natural quintic spline through points.
 
-    Powers of the local parameter s in [0, 1] of each segment. The conditions are written down one
-    by one and solved: values at both ends of every segment, derivatives 1 to 4 continuous at inner
-    knots, derivatives 3 and 4 zero at both ends. Two points are joined by a straight line.
+    The coefficients belong to the powers 0 to 5 of the local parameter s in [0, 1] of each segment.
+    The conditions are: values at both ends of every segment; derivatives 1 to 4 continuous at inner
+    points; derivatives 3 and 4 zero at both ends. Two points are joined by a straight line.
+
+    Args:
+        points: (segments + 1, n) points.
     """
     segments = len(points) - 1
     if segments == 1:
@@ -109,7 +111,7 @@ def _powers(s: float, order: int) -> Array:
 
 
 def rotation(rpy: Array) -> Array:
-    """Compute R_world_box (3, 3) by roll, pitch, yaw."""
+    """Compute R_world_box (3, 3) from roll, pitch, yaw `rpy` (3,) [rad]."""
     matrix: Array = Rotation.from_euler("xyz", rpy).as_matrix()
     return matrix
 
@@ -128,7 +130,8 @@ def box_rotation(orientation: Orientation, numbers: Array) -> Array:
 
 
 def euler_axes(rpy: Array) -> tuple[Array, Array, Array]:
-    """Return the world axes (3,) of the rotations by roll, pitch and yaw, in this order."""
+    """Return the axes (3,), in the world, of the rotations by roll, pitch and yaw, in this
+    order."""
     yaw = Rotation.from_euler("z", rpy[2])
     pitch = Rotation.from_euler("ZY", [rpy[2], rpy[1]])
     return pitch.apply([1.0, 0.0, 0.0]), yaw.apply([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
