@@ -172,7 +172,13 @@ def _postures(cell: Cell) -> ProgramResult:
 
 def _candidates(cell: Cell, count: int, seed: int) -> Iterator[ProgramResult]:
     """Evaluate random candidates. Yield how many are feasible, then what makes the others
-    infeasible."""
+    infeasible.
+
+    Args:
+        cell: the cell.
+        count: number of candidates.
+        seed: seed of the random numbers.
+    """
     found = cell.evaluate(cell.random(count, np.random.default_rng(seed)))
     share, reasons = float(found.feasible.mean()), found.infeasible_by_reason
     lines = [
@@ -224,6 +230,7 @@ def _pairs(cell: Cell, listed: bool) -> ProgramResult:
     reasons.
 
     Args:
+        cell: the cell.
         listed: True to list every pair by name.
     """
     geometry = cell.geometry
@@ -331,11 +338,13 @@ def _branch(cell: Cell, arm: int, branch: StartBranch) -> Branch:
 
 
 def _clearance_mm(cell: Cell, arm: int, branch: StartBranch) -> float | None:
-    """Measure the least distance of one arm from all other bodies by FCL, along those samples of
-    the hand-made trajectory that it can follow from a start branch [mm]. None if no pair of bodies
-    includes the arm.
+    """Measure the least distance of one arm from all other bodies by FCL [mm].
+
+    It is measured along those samples of the hand-made trajectory that the arm can follow from a
+    start branch. The result is None if no pair of bodies includes the arm.
 
     Args:
+        cell: the cell.
         arm: index of the arm.
         branch: the start branch.
     """

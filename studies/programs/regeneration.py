@@ -38,6 +38,7 @@ def _regenerated(
 
     Args:
         cache: cache of compiled functions.
+        options: parsed command line.
         found: list to which comparisons of functions are added.
     """
     largest = largest_size()

@@ -75,9 +75,16 @@ from symbolic.records import Workcell
 def simulate_arms(
     cell: Cell, carry: Carry, settings: ArmSettings, options: argparse.Namespace
 ) -> str:
-    """Simulate a carry with both arms and print the results: the least factor of the planned forces
-    that holds the box, the job with the commanded forces, and random cases of the uncertainty.
-    Return the simulated cell as MJCF.
+    """Simulate a carry with both arms, print the results, and return the simulated cell as MJCF.
+
+    The results are the least factor of the planned forces that holds the box, the job with the
+    commanded forces, and random cases of the uncertainty.
+
+    Args:
+        cell: the cell.
+        carry: the carry.
+        settings: settings of the simulation.
+        options: parsed command line.
 
     Raises:
         SimulationError: with --sweep, the box holds at the lower factor or slips at the upper
@@ -131,7 +138,10 @@ def _cases(
     arrive.
 
     Args:
+        cell: the cell.
         pressed: commands to both arms, with the normal forces of a job.
+        settings: settings of the simulation.
+        options: parsed command line, with the number of cases and the seed.
     """
     workcell, rng, leader = cell.workcell, np.random.default_rng(options.seed), options.leader - 1
     control: Control = options.controller
@@ -180,8 +190,17 @@ USUAL_CONTROLLER: Control = "leader"
 def simulate_pads(
     cell: Cell, carry: Carry, settings: SimulationSettings, options: argparse.Namespace
 ) -> None:
-    """Simulate a carry with pads without arms and print the results: the least factor of the
-    planned forces that holds the box, its creep, and random cases of the uncertainty."""
+    """Simulate a carry with pads but without arms, and print the results.
+
+    These are the least factor of the planned forces that holds the box, the creep of the box, and
+    random cases of the uncertainty.
+
+    Args:
+        cell: the cell.
+        carry: the carry.
+        settings: settings of the simulation.
+        options: parsed command line.
+    """
     leader, workcell = options.leader - 1, cell.workcell
     moments = planned_moments(cell, carry) if settings.pads == "driven" else None
     witness = BoxSimulation(workcell, settings)
@@ -221,8 +240,17 @@ def simulate_pads(
 def simulate_hands(
     cell: Cell, carry: Carry, settings: SimulationSettings, options: argparse.Namespace
 ) -> None:
-    """Simulate a carry in hands without arms and print the results: the least factor of the planned
-    forces that holds the payload, and random cases of the uncertainty."""
+    """Simulate a carry in hands without arms, and print the results.
+
+    These are the least factor of the planned forces that holds the payload, and random cases of the
+    uncertainty.
+
+    Args:
+        cell: the cell.
+        carry: the carry.
+        settings: settings of the simulation.
+        options: parsed command line.
+    """
     workcell = cell.workcell
     print(
         f"  without arms; the payload swings at {swing_frequency(workcell, settings):.1f} Hz on "
@@ -270,8 +298,9 @@ def _tell_worst(
     """Simulate a carry with the worst friction of the uncertainty and print whether the box holds.
 
     Args:
-        pressed: simulation with the commanded forces; its argument is a factor of these.
+        pressed: simulation with the commanded forces, given a factor of these.
         planned: simulation with the planned forces.
+        workcell: the cell, with its uncertainty.
     """
     tracked = 1.0 - workcell.uncertainty.tracking
     outcome = pressed(tracked)
@@ -352,8 +381,8 @@ def simulate_file(options: argparse.Namespace) -> int:
 
 
 def _controller(workcell: Workcell, options: argparse.Namespace) -> str:
-    """Return the name of the controller to simulate: the one in the options, or else one that suits
-    the cell.
+    """Return the name of the controller to simulate: the one in the options, or one that suits the
+    cell.
 
     Raises:
         SimulationError: the requested controller does not suit the cell.
@@ -380,7 +409,13 @@ def _controller(workcell: Workcell, options: argparse.Namespace) -> str:
 
 
 def _timed(cell: Cell, x: Array, options: argparse.Namespace) -> Carry:
-    """Compute the carry of a decision vector x (n_var,) with the timing of an exported job."""
+    """Compute a carry with the timing of an exported job.
+
+    Args:
+        cell: the cell.
+        x: (n_var,) decision vector.
+        options: parsed command line, with the limits of the timing.
+    """
     model = cell.timing_model
     if options.planned_limit is not None:
         return exported_carry(cell, time_path(model, x, model.drive_limits(options.planned_limit)))

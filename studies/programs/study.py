@@ -111,6 +111,7 @@ def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
     """Return the stages of a study in order.
 
     Args:
+        study: choice of the stages and their settings.
         alone: True if the study's first experiment is drivable itself, so that there is no second
             one.
     """
@@ -248,6 +249,7 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
 
     Args:
         path: path of the workcell file.
+        options: parsed command line.
         with_paper: True to show the paper's values beside those of the study.
 
     Raises:

@@ -282,8 +282,15 @@ def _robust_forces(cell: Cell, x: Array, options: argparse.Namespace) -> int:
 
 
 def _priced(model: RobustModel, carry: Carry, options: argparse.Namespace) -> int:
-    """Print how much the normal forces of a carry grow with multiples of the uncertainty, and
-    whether they hold in random cases. Return the exit code."""
+    """Print how much a carry's normal forces grow with the uncertainty. Return the exit code.
+
+    The forces are computed for multiples of the uncertainty, and tested in random cases.
+
+    Args:
+        model: model of the forces in all cases of the uncertainty.
+        carry: the carry.
+        options: parsed command line.
+    """
     price = robust_price(
         model,
         carry,

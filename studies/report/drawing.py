@@ -181,6 +181,7 @@ def limit_line(axes: Axes, level: float, label: str, across: bool = True) -> Non
     """Draw a limit as a dashed line through a panel.
 
     Args:
+        axes: the panel.
         level: value of the limit on the axis that the line crosses.
         label: name in the legend.
         across: True for a horizontal line at y = `level`, False for a vertical one at x = `level`.
@@ -193,7 +194,8 @@ def rest_line(axes: Axes, level: float, label: str) -> None:
     """Draw a normal force of the payload at rest as a horizontal line.
 
     Args:
-        level: the force on the vertical axis.
+        axes: the panel.
+        level: the force on the vertical axis, in the unit of this axis.
         label: name in the legend.
     """
     axes.axhline(level, color="black", linewidth=0.8, linestyle=(0, (7, 2, 1, 2)), label=label)
@@ -203,6 +205,9 @@ def panel_label(axes: Axes, letter: str, text: str, bare: bool = False) -> None:
     """Write '(letter) text' above the left corner of a panel.
 
     Args:
+        axes: the panel.
+        letter: the letter.
+        text: the text.
         bare: True if nothing else stands above the panel. It saves Matplotlib a search that takes
             half the time of a layout.
     """

@@ -379,10 +379,14 @@ def _trajectory(cells: Cells, shown: PageTrajectory) -> dict[str, Any]:
 
 
 def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator[MeshGroup]:
-    """Yield the groups of trajectories as robots drive them: the recommended carry, the hand-made
-    path at some force limits, and the final fronts.
+    """Yield the groups of trajectories of the drivable experiment.
+
+    These are the recommended carry, the hand-made path at some force limits, and the final fronts,
+    all timed as robots drive them.
 
     Args:
+        data: what the report shows.
+        drivable: the drivable experiment.
         cell: index of the trajectories' cell on the page.
     """
     if data.recommended is not None:
@@ -412,10 +416,12 @@ def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator
 
 
 def _search_groups(data: ReportData, paper: bool) -> Iterator[MeshGroup]:
-    """Yield the groups of trajectories of the first experiment: the hand-made one, the selected
-    ones, and the fronts.
+    """Yield the groups of trajectories of a study's first experiment.
+
+    These are the hand-made trajectory, the selected ones, and the fronts.
 
     Args:
+        data: what the report shows.
         paper: False to yield the hand-made trajectory alone.
     """
     picked = [PageTrajectory(c.source, c.x, job=data.job(c.label)) for c in data.carries]

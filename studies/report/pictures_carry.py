@@ -39,6 +39,7 @@ def _per_robot(
     """Return a figure with one panel per robot, common axes and one legend.
 
     Args:
+        data: what the report shows, with the names of the robots.
         titles: titles of both axes.
         draw: function that draws into the panel of the robot with index 0 or 1.
         columns: number of columns of the legend; 0 for one row.
@@ -181,10 +182,11 @@ def joint_torques(data: ReportData) -> Figure:
 
 
 def _label_rings(axes: Axes, most: Array, top: float) -> None:
-    """Label the rings of a polar plot at round values. The labels stand between two neighbouring
-    joints where there is most room.
+    """Label the rings of a polar plot at round values, between two neighbouring joints with most
+    room.
 
     Args:
+        axes: the polar plot, with one direction per joint.
         most: (n,) largest use of each joint's torque [%].
         top: largest value of the plot [%].
     """

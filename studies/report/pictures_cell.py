@@ -117,7 +117,9 @@ def _pad_points(geometry: CellGeometry, i: int, rng: np.random.Generator) -> NDA
     """Compute positions of an arm's pad in random postures within the joint limits.
 
     Args:
+        geometry: geometry of the cell.
         i: index of the arm.
+        rng: source of the postures.
 
     Returns:
         (REACH_POSTURES, 3) positions in the world [m].
@@ -425,10 +427,11 @@ CLOSE_UP = 0.25
 def meeting(
     geometry: CellGeometry, pair: tuple[str, str], pose: Array, q: Array, title: str
 ) -> Figure:
-    """Draw two colliding bodies in red: once in the whole cell, and twice with their surroundings,
-    from two sides.
+    """Draw two colliding bodies in red: once in the whole cell, and from two sides with their
+    surroundings.
 
     Args:
+        geometry: geometry of the cell.
         pair: names of the bodies.
         pose: (6,) pose of the box at the collision [m, rad].
         q: (joints,) joint positions of both arms at the collision [rad].

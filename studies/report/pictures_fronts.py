@@ -130,7 +130,8 @@ def polish(data: ReportData) -> Figure:
 
 
 def _paired(axes: Axes, algorithms: Sequence[AlgorithmRuns]) -> None:
-    """Draw the hypervolume of every replica before and after the polish."""
+    """Draw into `axes` the hypervolume of every replica of the algorithms before and after the
+    polish."""
     names = []
     for k, algorithm in enumerate(algorithms):
         look = algorithm.look
@@ -150,8 +151,10 @@ def _paired(axes: Axes, algorithms: Sequence[AlgorithmRuns]) -> None:
 
 
 def _objectives(axes: Axes, data: ReportData) -> None:
-    """Prepare axes for the first two objectives, with the level payload at rest and the star of the
-    recommended carry."""
+    """Prepare axes for the first two objectives, with marks for two carries.
+
+    A cross marks the level payload at rest, a star the recommended carry.
+    """
     if data.at_rest is not None:
         look: dict[str, Any] = {
             "color": "black",
@@ -169,16 +172,17 @@ def _objectives(axes: Axes, data: ReportData) -> None:
 
 
 def _recommended(axes: Axes, data: ReportData) -> None:
-    """Draw the star of the recommended carry, if its objectives are those of the axes."""
+    """Draw the star of the recommended carry, if the axes show its two objectives."""
     if (at := data.recommended_objectives) is not None:
         axes.plot(*at, **RECOMMENDED_STYLE.marks(9.0, MARKED), label="recommended, driven")
 
 
 def _zoom(axes: Axes, data: ReportData, sets: Sequence[Array]) -> None:
-    """Set the limits of axes such that fronts, the level payload at rest and the recommended carry
-    are visible.
+    """Set the limits of axes such that fronts and marked carries are visible.
 
     Args:
+        axes: axes of the first two objectives.
+        data: what the report shows, with the level payload at rest and the recommended carry.
         sets: objectives (k, n_obj) of each front.
     """
     points = [np.atleast_2d(points)[:, :2] for points in sets if len(points)]

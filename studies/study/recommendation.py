@@ -334,8 +334,11 @@ def _hand_made(cell: ho.Cell) -> Array:
 
 
 def _why_none(cell: ho.Cell, results: CampaignResults) -> str:
-    """Return a text on why no drivable carry was found: the constraints that candidates violated,
-    and why the hand-made trajectory cannot be driven."""
+    """Return a text on why a search found no drivable carry in a cell.
+
+    The text states the constraints that candidates violated, and why the hand-made trajectory
+    cannot be driven.
+    """
     found = concatenated([replica.evaluations for replica in results.replicas])
     stopped = ", ".join(
         f"{name.replace('_', ' ')} {100.0 * count / len(found):.1f} %"

@@ -241,8 +241,10 @@ def is_done(root: Path, one: SimulationRequest) -> bool:
 
 
 def wanted_carries(root: Path) -> list[SimulationRequest]:
-    """Return the carries to simulate whose files exist: the hand-made one, the best of each
-    algorithm, and the recommended one."""
+    """Return the carries of a study to simulate, if their files exist in the results folder `root`.
+
+    These are the hand-made one, the best of each algorithm, and the recommended one.
+    """
     summary = read_summary(root)
     shown, places = summary.shown_files, ["", *summary.algorithms]
     files = {
@@ -274,11 +276,16 @@ def _simulated(one: SimulationRequest) -> StoredSimulation:
 def _simulated_hands(
     carry: Carry, label: str, trajectory: str, controller: str
 ) -> StoredSimulation:
-    """Simulate a carry in hands without arms: find the least factor of its planned forces that
-    holds the payload, and run it with the forces that hold in every case of the uncertainty.
+    """Simulate a carry in hands without arms, and return the record to store.
+
+    The least factor of the planned forces that holds the payload is found. The stored simulation
+    has the forces that hold in every case of the uncertainty.
 
     Args:
+        carry: the carry.
+        label: name of the carry.
         trajectory: SHA-256 of the carry's trajectory file.
+        controller: name of the control law, which is only stored.
     """
     threshold, workcell = hand_threshold(carry), carry.workcell
     robust = commanded_forces(workcell, carry, SqueezeSettings(), itemised=False)[0].max(axis=0)

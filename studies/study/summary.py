@@ -153,8 +153,8 @@ class ReplicaFigures(FrontFigures):
 
 @dataclass(frozen=True)
 class PolishedStatistics:
-    """Statistics of an algorithm's polished fronts over its replicas: of each figure by name, of
-    the gain in hypervolume by the polish, and the number of replicas with a gain."""
+    """Statistics of an algorithm's polished fronts over its replicas: `statistics` of each figure
+    by name, the gain in hypervolume by the polish, and the number of replicas with a gain."""
 
     statistics: Mapping[str, Summary]
     hypervolume_gain: Summary
@@ -548,8 +548,8 @@ def _run(folder: CampaignFolder, progress: Progress, not_asked: str) -> None:
 
 
 def _polished_figures(folder: CampaignFolder, front: Front, reference: Array) -> PolishedFigures:
-    """Return the figures of a polished front, and write the trajectory file of the solution
-    selected from it."""
+    """Return the figures of a polished front, and write to `folder` the trajectory file of the
+    carry selected from it. `reference` (k, n_obj) is the reference front for the IGD."""
     assert front.polished is not None
     chosen = select(folder.cell.evaluator, front.x)
     path = polished_selected_file(folder.root, *front.key)
@@ -573,8 +573,8 @@ def _store_hand_made(folder: CampaignFolder) -> SelectedEntry | None:
 def _store_selected(
     folder: CampaignFolder, path: Path, replica: tuple[str, int], selected: SelectedCarry | None
 ) -> str | None:
-    """Write the trajectory file of a selected carry. Return its path relative to the results
-    folder, None without a selected carry."""
+    """Write the trajectory file of a carry selected from a `replica` (algorithm, number). Return
+    its path relative to the results folder, None without a selected carry."""
     if selected is None:
         return None
     provenance = {
@@ -587,8 +587,8 @@ def _store_selected(
 
 
 def _store(folder: CampaignFolder, path: Path, carry: Carry, provenance: Mapping[str, Any]) -> str:
-    """Write the trajectory file of an evaluated carry. Return its path relative to the results
-    folder."""
+    """Write the trajectory file of an evaluated carry, with JSON values on its origin. Return its
+    path relative to the results folder."""
     with storing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     # An infeasible one may be without some of its figures.

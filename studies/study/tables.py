@@ -108,6 +108,7 @@ def quality(
     Table 1).
 
     Args:
+        summary: summary of the experiment.
         with_paper: True to add rows with the paper's values.
         name: name of the table's file, without suffix.
         heading: sentence above the table.
@@ -202,6 +203,7 @@ def selected(summary: CampaignSummary, with_paper: bool) -> Table:
     """Return the table of the normal forces of the selected trajectories (paper Table 2).
 
     Args:
+        summary: summary of the experiment.
         with_paper: True to add rows with the paper's values.
     """
     rows = [_forces("hand-made", summary.hand_made)]
@@ -409,10 +411,11 @@ def time_against_force(found: StoredRecommendation) -> Table:
 
 
 def robust_price(price: RobustPrice, robots: Sequence[str]) -> Table:
-    """Return the table of the normal forces with which the recommended carry holds in multiples of
-    the uncertainty.
+    """Return the table of a recommended carry's normal forces that hold in multiples of the
+    uncertainty.
 
     Args:
+        price: the forces by multiple.
         robots: names of both robots.
     """
     check, of = price.check, "" if price.uncertainty.stated else ", the usual one"

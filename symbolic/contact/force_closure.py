@@ -160,10 +160,11 @@ def balance_maps(workcell: Workcell, in_units: bool = False) -> list[Array]:
 
 
 def _balanced_states(workcell: Workcell, share: float) -> tuple[Array, ...] | None:
-    """Find one scaled state (4,) per pad that lies within the cone for `share` times the friction,
-    so that the wrenches of all pads sum to zero; None if there are none.
+    """Find one scaled state (4,) per pad such that the wrenches of all pads sum to zero; None if
+    impossible.
 
-    Each state is a sum, with positive weights, of points on the cone's boundary.
+    Each state lies within the pad's cone for `share` times the friction. It is a sum, with positive
+    weights, of points on the cone's boundary.
     """
     maps = balance_maps(workcell)
     lessened = [_with_friction(_generators(pad), share) for pad in workcell.pads]

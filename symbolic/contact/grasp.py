@@ -202,17 +202,19 @@ class Grasp:
 
     @cached_property
     def _at_rest(self) -> tuple[ca.SX, ca.SX]:
-        """States (n,) of all pads, one after the other, with the payload at rest, and their
-        derivatives (n, 6) by the load.
+        """States of all pads with the payload at rest, and their derivatives by the load.
 
-        These states balance the load at rest and lie on the program's central path.
+        The scaled wrenches (n,) stand one after the other; the derivatives are (n, 6). These states
+        balance the load at rest and lie on the program's central path.
         """
         numbers = self.numbers if self.numbers.rest is not None else self.complete()
         return ca.SX(number(numbers.rest)), ca.SX(number(numbers.rest_slopes))
 
     def complete(self) -> GraspNumbers:
-        """Return the constants together with the states `rest` and derivatives `rest_slopes` of the
-        payload at rest. The grasp must have no symbolic parameters."""
+        """Return the constants together with the pads' states for the payload at rest.
+
+        These are the fields `rest` and `rest_slopes`. The grasp must have no symbolic parameters.
+        """
         inputs = [self.numbers.load_at_rest, *map(np.array, self._nominal())]
         load, *sizes = [ca.SX(ca.DM(value)) for value in inputs][: 1 + len(SCALING_INPUTS)]
         asked, given = self.least_states(load, *sizes), self.squeeze_states(*sizes)
@@ -221,12 +223,13 @@ class Grasp:
         return replace(self.numbers, rest=rest, rest_slopes=slopes)
 
     def _nominal(self) -> tuple[list[float], ...]:
-        """Return the values of the inputs after the load in the workcell: friction (2,)."""
+        """Return the workcell's values of the program's inputs, without the load: friction (2,)."""
         return (np.array(ca.evalf(self.friction)).ravel().tolist(),)
 
     def least_states(self, load: ca.SX, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
-        """Compute the states (4,) of all pads that balance a load (6,) with the least norm. They
-        may lie outside the friction cones.
+        """Compute the scaled wrenches (4,) of all pads that balance a load with the least norm.
+
+        They may lie outside the friction cones.
 
         Args:
             load: (6,) force and moment about the box frame's origin, along the box's axes.

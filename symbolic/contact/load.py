@@ -163,8 +163,8 @@ def _grasp_load_function(workcell: Workcell) -> ca.Function:
 
 
 def _named(inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
-    """Build the function `uncertain_load` from inputs and outputs by name; its outputs are
-    `LOAD_OUTPUTS`."""
+    """Build the function `uncertain_load`, whose outputs are `LOAD_OUTPUTS`, from its inputs and
+    outputs by name."""
     ordered = {name: outputs[name] for name in LOAD_OUTPUTS}
     return named_function("uncertain_load", inputs, ordered, cse=False)
 

@@ -82,8 +82,15 @@ class PaperContact(ContactModel):
         )
 
     def force_quantities(self, load: ContactLoad, held: HeldLoad) -> Expression:
-        """Compute the normal component F_n and the tangential magnitude F_t of the required force,
-        (2,) [N]."""
+        """Compute the normal component F_n and the tangential magnitude F_t of the required force.
+
+        Args:
+            load: load on both contacts.
+            held: contact forces, which are not needed.
+
+        Returns:
+            (2,) F_n and F_t [N].
+        """
         return ca.vertcat(*split_force(load.force, load.axes[:, 2])[:2])
 
     def planned_quantities(self, found: Mapping[str, Array]) -> Array:

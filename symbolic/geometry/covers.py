@@ -75,7 +75,7 @@ def _slab_cover(seen: CacheKey) -> tuple[Piece, ...]:
 
 
 def chain_cover(body: CollisionBody) -> SphereChain:
-    """Cover a body by a chain of equal spheres along its longest principal side."""
+    """Cover a body by equal spheres in a row along its longest principal side."""
     return _chain_cover(CacheKey(body.pieces))
 
 
@@ -87,7 +87,8 @@ def _chain_cover(seen: CacheKey) -> SphereChain:
 
 
 def close_pairs(geometry: CellGeometry) -> frozenset[tuple[int, int]]:
-    """Return the pairs of bodies of one arm whose chains of spheres overlap in many postures.
+    """Return the pairs of bodies of one arm whose rows of spheres (`chain_cover`) overlap in many
+    postures.
 
     Each pair consists of the indices of both bodies.
     """

@@ -387,5 +387,8 @@ class _Growth:
 
 
 def _beyond(points: Array, planes: Array) -> bool:
-    """Return True if any of the points (n, 3) is outside of any of the planes (m, 4)."""
+    """Return True if any of the points (n, 3) [m] lies outside any of the planes (m, 4).
+
+    A plane is its outward unit normal and its offset [m].
+    """
     return bool(np.any(points @ planes[:, :3].T + planes[:, 3] > ROUNDOFF))

@@ -332,7 +332,7 @@ class SphereChain:
 
 
 def sphere_chain(pieces: tuple[Piece, ...], rotation: Array, slenderness: float) -> SphereChain:
-    """Cover pieces by a chain of equal spheres along the longest side of their bounding box.
+    """Cover pieces by a row of equal spheres along the longest side of their bounding box.
 
     Args:
         pieces: pieces in one frame.

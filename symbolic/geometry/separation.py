@@ -101,7 +101,8 @@ def out_of_reach(
 
 
 def _gap(zone: Piece, pieces: tuple[Piece, ...]) -> float:
-    """Compute the distance [m] between a zone and pieces in one frame; at most 0 if they meet."""
+    """Compute the distance [m] between a region `zone` and pieces in one frame; at most 0 if they
+    meet."""
     if isinstance(zone.shape, Sphere):
         return min(_from_point(p, zone.centre) for p in pieces) - zone.shape.radius
     return coal_distance((zone,), pieces)

@@ -145,8 +145,8 @@ def resample_decisions(x: Array, source: Task, target: Task) -> Array:
 
 @cache
 def _through(n: int, m: int) -> Array:
-    """Compute the matrix (m, n) that maps n waypoints to m points of their spline, evenly spaced in
-    u."""
+    """Compute the matrix (m, n) from n waypoints to m points of their spline, evenly spaced
+    in u."""
     u = np.linspace(0.0, 1.0, m)
     by = path_position(n, u).copy()
     known, where = np.divmod(np.arange(m) * (n - 1), m - 1)

@@ -437,7 +437,14 @@ def _as_bundle_errors(subject: str = "") -> Iterator[None]:
 
 
 def _replaced(text: str, reference: str, moved: str, file: str) -> str:
-    """Replace every quoted occurrence of a reference in a text."""
+    """Return a text in which every quoted `reference` is replaced by the path `moved`.
+
+    Args:
+        text: the text of a file.
+        reference: the path or address to replace.
+        moved: the new path.
+        file: name of the file, for messages.
+    """
     for quote in ('"', "'"):
         if f"{quote}{reference}{quote}" in text:
             return text.replace(f"{quote}{reference}{quote}", f"{quote}{moved}{quote}")

@@ -172,7 +172,7 @@ class TableReader:
         return checked_vector(value, allowed, self.at(key), self.problems, filling)
 
     def integer(self, key: str, low: int, high: int, default: int) -> int:
-        """Read an integer from `low` to `high`; `default` if the key is missing."""
+        """Read the integer from `low` to `high` at a key; `default` if the key is missing."""
         found: int = self.value(key, Annotated[int, Range(low, high)], default)
         return found
 

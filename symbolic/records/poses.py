@@ -136,7 +136,12 @@ def box_placement(orientation: Orientation, pose: ArrayLike) -> Array:
 
 
 def pose_matrix(xyz: ArrayLike, rpy: ArrayLike) -> Array:
-    """Compute the transform (4, 4) of a position (3,) [m] and of roll, pitch, yaw (3,) [rad]."""
+    """Compute the transform (4, 4) of a position and an orientation.
+
+    Args:
+        xyz: (3,) position [m].
+        rpy: (3,) roll, pitch, yaw [rad].
+    """
     return transform(rotation_from_rpy(rpy), xyz)
 
 

@@ -111,8 +111,11 @@ class _Short(reprlib.Repr):
     """Variant of `repr` that reads only as much of a value as a message can show."""
 
     def repr_int(self, x: int, level: int) -> str:
-        """Return an integer's digits, or the number of its bits if it has 200 or more: Python
-        refuses to print thousands of digits."""
+        """Return an integer x as text: its digits, or only its number of bits if it has 200 or
+        more.
+
+        Python refuses to print thousands of digits.
+        """
         return repr(x) if x.bit_length() < 200 else f"a number of {x.bit_length()} bits"
 
 
@@ -142,8 +145,12 @@ Label = Annotated[str, TextPattern(text_problem)]
 
 
 def text_pattern(pattern: str, meaning: str) -> TextPattern:
-    """Return a `TextPattern` that allows the texts that match the regular expression `pattern`;
-    `meaning` describes them in messages."""
+    """Return a `TextPattern` that allows the texts that match a regular expression.
+
+    Args:
+        pattern: the regular expression.
+        meaning: description of the allowed texts, for messages.
+    """
     form = re.compile(pattern)
 
     def problem(value: Any) -> str:
@@ -156,8 +163,8 @@ def text_pattern(pattern: str, meaning: str) -> TextPattern:
 
 
 def matching(pattern: str, names: Iterable[str]) -> tuple[str, ...]:
-    """Return the names that match a pattern, in which `*` stands for any text and `?` for any
-    character.
+    """Return those of the `names` that match a pattern, in which `*` stands for any text and `?`
+    for any character.
 
     A pattern that equals a name matches this name only, even if it contains such characters.
     """

@@ -238,14 +238,29 @@ def components(orientation: Orientation) -> tuple[str, ...]:
 
 
 def waypoints_of(task: Task, x: Array) -> Array:
-    """Return the box poses at all waypoints (..., n_waypoints, 6) [m, rad] of decision vectors x
-    (..., n_var), with unwrapped angles."""
+    """Return the box poses at all waypoints of decision vectors, with unwrapped angles.
+
+    Args:
+        task: task with n_waypoints waypoints, fixed and free.
+        x: (..., n_var) decision vectors.
+
+    Returns:
+        (..., n_waypoints, 6) poses [m, rad].
+    """
     return extended_waypoints(task, x)[..., :POSE_SIZE]
 
 
 def extended_waypoints(task: Task, x: Array) -> Array:
-    """Return the box pose and the redundant joints at all waypoints, (..., n_waypoints, 6 + m), of
-    decision vectors x (..., n_var), with unwrapped angles."""
+    """Return the box poses and redundant joints at all waypoints of decision vectors, with
+    unwrapped angles.
+
+    Args:
+        task: task with n_waypoints waypoints and m redundant joints.
+        x: (..., n_var) decision vectors.
+
+    Returns:
+        (..., n_waypoints, 6 + m) poses [m, rad], then redundant joints [rad or m].
+    """
     points = np.empty((*x.shape[:-1], *task.fixed_waypoints.shape))
     points[...] = task.fixed_waypoints
     rows, columns = task.free_entries

@@ -185,8 +185,9 @@ def torque_function(robot: Robot, model: RobotModel, contact: Contact, name: str
 
 
 def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str, ca.Function]:
-    """Build the steps of `track_function` by name. Conditional steps copy their input if the
-    condition is false.
+    """Build the steps of `track_function` as functions by name.
+
+    Conditional steps copy their input if the condition is false.
 
     target: pose -> R_world_box, and the flange's target. approach: state, pose, target -> joints
     after `CHEAP_STEPS`, and the residual before the last step. closer: joints, target -> joints
@@ -194,6 +195,9 @@ def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str,
     target, result of `place` -> the better of this result and `IK_NEWTON_STEPS` steps by QR. held:
     previous joints, target, result so far -> result of `place` at the previous joints. measures:
     joints, jacobian, R_world_box, wrench -> limit margin, manipulability, joint torque.
+
+    Args:
+        robot, model, contact: the arm, its model, and its contact with the box.
     """
     n = model.n_joints
     state, pose = ca.SX.sym("state", 3 * n + 1), ca.SX.sym("pose", model.pose_size)

@@ -254,8 +254,11 @@ def _spread(count: int) -> Array:
 
 
 def _distinct(q: Array) -> Array:
-    """Return the rows of q that differ from all earlier rows by more than `BRANCH_TOLERANCE`, up to
-    full turns.
+    """Return the postures (rows of q) that differ from all earlier ones by more than
+    `BRANCH_TOLERANCE`.
+
+    Args:
+        q: (m, n) joint positions [rad]; positions that differ by full turns count as equal.
     """
     kept = []
     while len(q):

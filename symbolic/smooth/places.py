@@ -282,14 +282,22 @@ class ManipulabilityLimit(PathConstraint):
 
 
 def row_name(family: str, order: Order) -> str:
-    """Return the name of the function that `row_function` builds for a family of constraints, with
-    derivatives of order 'first' or 'second'."""
+    """Return the name of the function that `row_function` builds for a family of constraints.
+
+    Args:
+        family: name of the family.
+        order: 'first' or 'second', the order of the derivatives.
+    """
     return f"row_{family}_{order}"
 
 
 def closure_name(arm: int, order: Order) -> str:
-    """Return the name of the function that `closure_functions` builds for the arm with index `arm`,
-    with derivatives of order 'first' or 'second'."""
+    """Return the name of the function that `closure_functions` builds for an arm.
+
+    Args:
+        arm: index of the arm.
+        order: 'first' or 'second', the order of the derivatives.
+    """
     return f"closure_{arm + 1}_{order}"
 
 

@@ -73,7 +73,13 @@ DIFFERENCE_WINDOW = 5
 
 def sample_name(quantity: Quantity, block: Block, order: Order) -> str:
     """Return the name of the function that `sample_functions` builds for a quantity and a block of
-    samples, with derivatives of order 'first' or 'second'."""
+    samples.
+
+    Args:
+        quantity: 'force', 'pressure' or 'load'.
+        block: name of the block, as in `SampleBlock`.
+        order: 'first' or 'second', the order of the derivatives.
+    """
     return f"{quantity}_{block}_{order}"
 
 
