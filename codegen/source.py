@@ -196,12 +196,13 @@ def _filled(driver: str, signature: Signature, generated: str = "") -> str:
 
 
 def operations(function: ca.Function, left_out: frozenset[str] = frozenset()) -> int:
-    """Count the instructions that one evaluation runs.
+    """Count the instructions that one evaluation of a CasADi function runs.
 
     Nested calls count with all their instructions, as often as they run. Both branches of a choice
     count. An instruction on a whole vector counts once.
 
     Args:
+        function: the function.
         left_out: names of functions that do not count.
     """
     return _operations(function, {}, left_out)

@@ -104,7 +104,7 @@ class Tape:
 
     @cached_property
     def program(self) -> Any:
-        """The instructions as an object of the extension module, which runs them."""
+        """Object of the extension module that holds the instructions and runs them."""
         count = len(self.signature.input_names)
         found = (self.instructions[name] for name in ("code", "constant"))
         codes, constants = map(np.ascontiguousarray, found)

@@ -68,11 +68,8 @@ WORKERS_LOAD = (
 
 
 def add_options(parser: Parser, output: str) -> None:
-    """Add the options of a study to a program's parser.
-
-    Args:
-        output: the default results folder, for the help text.
-    """
+    """Add the options of a study to a program's parser; `output` is the default folder in the help
+    text."""
     search = parser.add_argument_group("search (decides the results)")
     search.add_argument(
         "--quick",
@@ -268,10 +265,12 @@ def _add_options(parser: Parser) -> None:
 
 
 def complete(options: argparse.Namespace, name: str) -> None:
-    """Set the results folder to `results/NAME` unless the options state one, and check that the
-    extras that the options need are installed.
+    """Set the results folder to `results/NAME` unless the options state one; check the extras.
+
+    The extras that the options need have to be installed.
 
     Args:
+        options: parsed command line, which is changed.
         name: name of the study.
 
     Raises:

@@ -95,8 +95,11 @@ def build_cell_bodies(workcell: Workcell, known: CellBodies | None = None) -> Ce
 
 
 def _compared(bodies: CellBodies) -> tuple[object, ...]:
-    """Return the pairs of bodies whose distances the cell's functions compute, and how many of
-    these pairs, from the first, are near."""
+    """Return the pairs of bodies for which the cell's functions compute distances, and the number
+    of near ones.
+
+    The near pairs come first.
+    """
     return bodies.geometry.possible, bodies.geometry.near
 
 

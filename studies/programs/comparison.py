@@ -81,11 +81,14 @@ class CampaignComparison:
 
 
 def compare(first: Path, second: Path) -> CampaignComparison:
-    """Compare the campaigns in two results folders.
+    """Compare the finished campaigns in two results folders, figure by figure.
+
+    Args:
+        first, second: the folders.
 
     Raises:
-        ResultsError: a folder is not a finished campaign, they share no algorithm, or they
-            minimise different objectives.
+        ResultsError: a folder is not a finished campaign, they share no algorithm, or they minimise
+            different objectives.
     """
     folders = (first, second)
     runs = tuple(read_campaign(folder) for folder in folders)

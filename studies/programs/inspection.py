@@ -405,6 +405,7 @@ def show(carry: Carry, why: Explanation | None, path: Path) -> str:
     """Write a page that plays a carry from its first failure on, with colliding bodies in red.
 
     Args:
+        carry: the carry.
         why: the first failure; None for a feasible carry.
         path: path of the page.
 

@@ -333,6 +333,7 @@ def _experiment(results: CampaignResults, select: bool = True) -> Experiment:
     """Read an experiment from its results folder.
 
     Args:
+        results: the results folder.
         select: True to select a trajectory from the representative replica of each algorithm.
     """
     summary, fronts = read_summary(results.root), results.fronts

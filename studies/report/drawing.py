@@ -228,10 +228,13 @@ def files_of(figure: Figure, pdf: bool = True) -> dict[str, bytes]:
 
 
 def save(figure: Figure, folder: Path, name: str, pdf: bool = True) -> tuple[Path, ...]:
-    """Write a figure with fixed layout to a folder as PNG, and as PDF if wanted. Return the paths.
+    """Write a figure with fixed layout to a folder as PNG, and as PDF if `pdf`. Return the paths.
 
     Args:
+        figure: the figure.
+        folder: the folder.
         name: name of the files, without suffix.
+        pdf: True to write a PDF too.
     """
     paths = []
     for suffix, content in files_of(figure, pdf).items():
@@ -520,10 +523,13 @@ MARGIN = 0.06
 
 
 def frame_axes(axes: Axes, view: View, points: Array, margin: float = MARGIN) -> None:
-    """Set the limits of a picture such that it contains given points, with equal scales. Axes
-    without titles in the view are hidden.
+    """Set the limits of a picture such that it contains given points, with equal scales.
+
+    The axes are hidden if the view has no titles for them.
 
     Args:
+        axes: axes of the picture.
+        view: direction from which the points are seen.
         points: (n, 3) points in the world [m].
         margin: distance of the points from the border [m].
     """

@@ -389,8 +389,7 @@ that closely."""
 
 
 def _timed(cell: ho.Cell, driving: ReadyCell, shown: PageTrajectory) -> tuple[Timing | None, str]:
-    """Time a trajectory as robots drive it. Return the timing and '', or the failed timing or None
-    and the reason why robots cannot drive the trajectory.
+    """Compute the timing of a trajectory as robots drive it.
 
     Args:
         cell: the cell of the trajectory.

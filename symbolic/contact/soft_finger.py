@@ -121,7 +121,7 @@ class SoftFingers:
 def torsion_capacity(
     grip: Expression, tangent: Expression, patch: SoftPatch
 ) -> tuple[Expression, Expression]:
-    """Compute the largest torsion that a pad can bear, the right side of (1) [N m], and its
+    """Compute the largest torsion that a pad can bear [N m] by formula (1) of the module, and its
     derivative by the grip [m].
 
     Args:
@@ -157,7 +157,7 @@ def _squared(tangent: Expression) -> Expression:
 
 
 def _half_spread(patch: SoftPatch, tangent: Expression) -> Expression:
-    """Compute the length h / 2 in formula (1) [m] for a tangential force.
+    """Compute the length h / 2 in formula (1) of the module [m] for a tangential force.
 
     Args:
         patch: shape of the contact patch.
@@ -296,8 +296,11 @@ def _first_grip(
     squared: Both,
     ahead: Expression,
 ) -> Expression:
-    """Estimate the grip of the pad that slips first [N], for torsion levers linear in s of (1). In
-    all pairs this pad comes first.
+    """Estimate the grip of the pad that slips first: the friction that its tangential force leaves
+    [N].
+
+    The torsion of each pad is taken as grip times a lever that is linear in s of formula (1) of the
+    module. In all pairs of arguments the pad that slips first comes first.
 
     Args:
         asked: absolute torsion that both pads bear together [N m].

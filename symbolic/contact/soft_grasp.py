@@ -140,13 +140,15 @@ class SoftGrasp:
 
 
 class _Local:
-    """Derivatives of the objective f of the module at given states (n,) of all patches.
+    """Derivatives of the objective f(y, w) of the module at given states (n,) of all patches.
 
-    f is the sum of the barriers, patch by patch, and log effort. The curvature of log effort, Q /
-    effort - g g', is a rank-one change of a diagonal.
+    f is log effort plus the weighted barriers of the patches; y are the free components, w the
+    load, and Y is the derivative of the states by y. The curvature of log effort, Q / effort - g
+    g', has a rank-one part, which is treated separately.
 
     Attributes:
-        slope: gradient (n,) of f: the gradient g of log effort plus that of the barriers.
+        slope: gradient (n,) of f by the states: the gradient g of log effort plus the gradients of
+            the barriers.
     """
 
     def __init__(self, program: SoftGrasp, state: ca.SX) -> None:
@@ -164,7 +166,14 @@ class _Local:
         self._share = 1.0 / (1.0 - ca.dot(self._g, self._answer))
 
     def solve(self, pull: ca.SX) -> ca.SX:
-        """Solve Y' F Y y = Y' pull for y and return the change Y y (n,) of the states."""
+        """Compute the change Y y (n,) of the states, where y solves Y' F Y y = Y' pull.
+
+        F is the Hessian of f by the states, Y the derivative of the states by their free
+        components.
+
+        Args:
+            pull: (n,) right side, one entry per entry of the states.
+        """
         return self._with_g(self._effort * self._equations.balanced_change(pull))
 
     def by_load(self) -> ca.SX:
@@ -181,11 +190,11 @@ class _Local:
         return found + ca.mtimes(self._answer, self._share * ca.mtimes(self._g.T, found))
 
     def third(self, along: ca.SX, by_load: ca.SX) -> ca.SX:
-        """Compute U' T[d] U (6, 6) from the third derivative T of the function f.
+        """Compute U' T[d] U (6, 6), where T is the third derivative of f by the states.
 
         Args:
-            along: (n,) direction d.
-            by_load: (n, 6) directions U.
+            along: (n,) direction d of the states.
+            by_load: (n, 6) derivatives U of the states by the load.
         """
         rows = zip(
             self._program.grasp.patches,

@@ -468,12 +468,14 @@ def motion_function(
     name: str,
     pairs: Iterable[int],
 ) -> ca.Function:
-    """Build the function that bounds the relative motion of pairs between two configurations.
+    """Build the function that bounds the relative motion of pairs of bodies between two
+    configurations.
 
     Inputs: pose_a (6,), q_1_a, q_2_a (n,), then pose_b, q_1_b, q_2_b [m, rad]. Outputs: chord and
-    bend (n_pairs,) [m], the sums over both bodies of the module's D and K. For two links of one arm
-    the chord instead bounds the length of the later link's path as seen from the earlier link, and
-    the bend is zero.
+    bend (n_pairs,) [m], each the sum over both bodies of a pair. The chord bounds the distance of a
+    point's places in the two configurations, the bend the second derivative of its path (D and K of
+    the module). For two links of one arm the chord instead bounds the length of the later link's
+    path as seen from the earlier link, and the bend is zero.
 
     Args:
         geometry: bodies and pairs of the cell.
@@ -519,7 +521,10 @@ def _body_motion(
     placed_b: dict[Frame, tuple[ca.SX, ca.SX]],
     steps: list[ca.SX],
 ) -> tuple[ca.SX, ca.SX]:
-    """Compute the chord and bend [m] of one body between two configurations a and b.
+    """Compute bounds of a body's motion between two configurations a and b: chord and bend [m].
+
+    The chord bounds the distance of a point's places in a and b, the bend the second derivative of
+    its path.
 
     Args:
         screen: numbers of the bodies.

@@ -270,12 +270,13 @@ def _arms_of(body: CollisionBody) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class _PairStatus:
-    """Decision about a pair.
+    """Decision about a pair of bodies.
 
     Attributes:
-        reason: the reason to exclude the pair; '' if it is active.
-        possible: whether the pair is among the possible pairs.
-        far: whether few cells check the pair.
+        reason: the reason to exclude the pair; '' if it is checked.
+        possible: True if the pair is checked in this cell or with other parameters of the cell
+            (`CellGeometry.possible`).
+        far: True if only few cells check the pair.
     """
 
     reason: str
@@ -302,8 +303,9 @@ def _sorted(seen: CacheKey) -> _PairStatus:
 
 
 def _is_far(a: CollisionBody, b: CollisionBody) -> bool:
-    """Return True if one body is before an arm's second joint, and the other is neither of this arm
-    nor the payload.
+    """Return True for a pair that few cells check.
+
+    One body is before an arm's second joint, and the other is neither of this arm nor the payload.
     """
     still = any(x.root is not None or (x.frame.joint == 0 and not x.is_tool) for x in (a, b))
     return still and a.group != b.group and "payload" not in (a.group, b.group)

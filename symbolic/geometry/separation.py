@@ -202,7 +202,8 @@ def _zone_of(seen: CacheKey) -> Piece:
 
 @lru_cache(maxsize=256)
 def _zone_in_root(seen: CacheKey) -> Piece:
-    """Return the region of `_zone` in the frame of the arm's root."""
+    """Return the region of `_zone` in the frame of the arm's root, for a key that holds body, arm
+    and joint."""
     body, arm, below = seen.given
     first = below + 1
     T = arm.origins[first]

@@ -100,7 +100,7 @@ def driven_path(
 def _along(
     time: ca.MX, path: tuple[ca.MX, ca.MX, ca.MX], speed: ca.MX, acceleration: ca.MX
 ) -> TimedPath:
-    """Compute the timed path.
+    """Compute the motion along a path with a given timing.
 
     Args:
         time: (1, n) times of the samples [s].

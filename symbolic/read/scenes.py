@@ -184,7 +184,7 @@ class _Sdf:
     def _place(
         self, scope: _Scope, name: str, model: _Scope, placed: tuple[str, Array], by: ElementReader
     ) -> None:
-        """Add a model to a world or model (`scope`).
+        """Add a model, called `name`, to the world or model `scope`.
 
         Args:
             placed: name of a frame, and the pose (4, 4) of the model's placement frame in it.

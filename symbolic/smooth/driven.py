@@ -34,7 +34,7 @@ DRIVEN_FIRST, DRIVEN_SECOND = "driven_first", "driven_second"
 
 @dataclass(frozen=True)
 class DrivenLayout(BlockLayout):
-    """Layout of the vector of limited quantities at one point of a driven path.
+    """Layout of the vector of limited quantities at one point of a path that robots drive.
 
     Attributes:
         pose: number of entries of the extended pose, 6 + m with m redundant joints.

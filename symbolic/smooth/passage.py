@@ -148,8 +148,11 @@ class SeparatingAxisGap(PathConstraint):
 
 @dataclass(frozen=True, order=True)
 class AxisSwitchGap(PathConstraint):
-    """Constraint on the clearance [m] at the kink where the separating direction of payload and
-    obstacle changes: the height of the kink in the module's formula.
+    """Constraint on the clearance [m] where the separating direction of payload and obstacle
+    changes.
+
+    There the clearance has a kink, the point at which the gaps along both directions are equal. The
+    constrained value is the gap at this point.
 
     Attributes:
         pair: index of payload and obstacle among the active pairs.
