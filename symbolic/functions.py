@@ -292,12 +292,14 @@ def sample_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def kernel_numbers(workcell: Workcell, screen: Screen) -> dict[str, tuple[str, ...]]:
-    """Return the names of the parameter groups that each function of `kernel_functions` takes as
-    its last inputs, in this order, by name of the function.
+    """Return which parameter groups each function of `kernel_functions` takes as its last inputs.
 
     Args:
         workcell: the cell, with symbols as parameters.
         screen: the bodies' distance bounds, with symbols as parameters.
+
+    Returns:
+        Names of the groups in the order of the inputs, by name of the function.
     """
     arms, held = tuple(sx_parameters(*workcell.robots)), tuple(sx_parameters(workcell.payload))
     bodies = tuple(sx_parameters(screen))

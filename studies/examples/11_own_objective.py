@@ -13,7 +13,8 @@ import hybrid_opt as ho
 
 
 def height(outputs: Mapping[str, np.ndarray], workcell: ho.Workcell) -> np.ndarray:
-    """Compute the largest height of the box over twice the height of its goal, one per candidate.
+    """Compute the largest height of the box over twice its height at the goal, one value per
+    candidate.
 
     Args:
         outputs: results of the evaluation by name, with one entry per candidate.

@@ -377,6 +377,7 @@ class CutCell:
         """Cut solids of a cell into small triangles. The colour of a solid depends on its group.
 
         Args:
+            geometry: geometry of the cell.
             solids: the solids to draw.
             marked: names of solids that are drawn in red.
         """

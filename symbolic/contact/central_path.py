@@ -460,7 +460,7 @@ class Factors:
 
     def backward(self, reduced: ca.SX, others: ca.SX | None = None) -> ca.SX:
         """Compute all unknowns (n,) from the reduced right side (n,) of `forward` and from the n -
-        k other unknowns; None if k = n."""
+        k unknowns `others` that were not eliminated; None if k = n."""
         first = ca.vertsplit(reduced)[: len(self._below)]
         found = [value * over for value, over in zip(first, self._over_pivot, strict=True)]
         found += [] if others is None else ca.vertsplit(others)

@@ -181,11 +181,13 @@ class _Local:
         return self._with_g(self._equations.constrained(self._loaded))
 
     def _with_g(self, found: ca.SX) -> ca.SX:
-        """Correct solutions for the part -g g' of the curvature by the Sherman-Morrison formula. g
-        is the gradient of log effort.
+        """Return the solutions (n, k) of Newton's equations with the part -g g' of the curvature.
+
+        g (n,) is the gradient of log effort. The Sherman-Morrison formula corrects the solutions
+        without this part.
 
         Args:
-            found: (n, k) solutions of the equations without this part.
+            found: (n, k) solutions without this part.
         """
         return found + ca.mtimes(self._answer, self._share * ca.mtimes(self._g.T, found))
 

@@ -180,7 +180,7 @@ class DistanceBounds:
         self._chains: dict[int, list[ca.SX]] = {}
 
     def bound(self, pair: int) -> ca.SX:
-        """Compute a lower bound of the distance between the bodies of a pair [m].
+        """Compute a lower bound [m] of the distance between the two bodies of a pair.
 
         Args:
             pair: index of the pair among the possible pairs.
@@ -429,11 +429,13 @@ class DistanceBounds:
 
 
 def _ends(extent: Any, k: int) -> list[Interval]:
-    """Return (least, largest) coordinate along each of three directions, from rows 2 k and 2 k + 1.
+    """Return the interval of a body or piece along each of three directions: least, largest
+    coordinate.
 
     Args:
-        extent: (2 m, 3) table; its rows alternate between least and largest coordinates [m].
-        k: index of the pair of rows.
+        extent: (2 m, 3) table of m bodies or pieces, two rows for each: least, then largest
+            coordinates along the directions [m].
+        k: index of the body or piece.
     """
     rows = ca.SX(number(extent))
     return [(rows[2 * k, d], rows[2 * k + 1, d]) for d in range(3)]

@@ -156,7 +156,8 @@ def _apart(first: tuple[Piece, ...], second: tuple[Piece, ...], T: Array) -> NDA
 
 
 def _covered(piece: Piece, cover: list[Piece]) -> bool:
-    """Return True if a piece is an element of the cover, or lies inside one box of it; exact."""
+    """Return True if a piece is contained in the cover: as an element of it, or inside one box of
+    it."""
     return any(
         other is piece or (isinstance(other.shape, Box) and contains(other, piece))
         for other in cover

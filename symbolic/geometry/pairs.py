@@ -168,7 +168,7 @@ class CellGeometry:
 
 
 def pair_tolerance(workcell: Workcell, a: CollisionBody, b: CollisionBody) -> float:
-    """Return the distance up to which two bodies count as colliding [m].
+    """Return the distance up to which the bodies a and b count as colliding [m].
 
     This is the workcell's tolerance. For the payload the uncertainty of the pads' positions is
     added, if the cell states one: a box that is displaced in the grasp stays displaced along the

@@ -62,7 +62,7 @@ class CoverSolid:
 
 @dataclass(frozen=True)
 class ScreenChain:
-    """A chain of equal spheres.
+    """Equal spheres in a row that contain a body.
 
     Attributes:
         centres: (n, 3) centres of the spheres in the body's frame or in the world [m].
@@ -306,9 +306,8 @@ def _obstacle(piece: Piece) -> Obstacle:
 
 
 def _extent(piece: Piece, A: Array) -> Array:
-    """Compute the least and largest coordinate of a piece along each row of A (3, 3): (2,
-    3) [m].
-    """
+    """Compute the least and largest coordinate [m] of a piece along each row of A (3, 3), as (2,
+    3)."""
     return np.stack([-support(piece, -A), support(piece, A)])
 
 

@@ -126,7 +126,7 @@ def _edited(
 
 
 def _alike(found: Any, wanted: Any) -> bool:
-    """Return True if two nested values are equal, with NaN equal to NaN."""
+    """Return True if two nested values, found and wanted, are equal, with NaN equal to NaN."""
     if isinstance(found, Mapping) and isinstance(wanted, Mapping):
         return found.keys() == wanted.keys() and all(_alike(found[k], wanted[k]) for k in found)
     if isinstance(found, list) and isinstance(wanted, list):

@@ -366,7 +366,7 @@ def _read_moveit(path: Path, found: SceneBuilder) -> None:
 def _object(
     table: TableReader, frames: Mapping[str, Array], path: Path, found: SceneBuilder
 ) -> None:
-    """Add one collision object of a planning scene: its primitives, meshes and planes.
+    """Add one collision object of a planning scene, its primitives, meshes and planes, to `found`.
 
     The poses (4, 4) in `frames` are those of named frames in the world.
     """

@@ -100,8 +100,8 @@ def read_task(table: TableReader, holding: Array) -> tuple[Task, tuple[Redundanc
 
 
 def _allocation(table: TableReader, law: TimeLaw, holds: bool) -> str:
-    """Read the name of the contact model. The default is 'holding-hands' for hands with a holding
-    force, else 'soft-finger' in drivable cells, else 'paper'."""
+    """Read the name of the contact model; if none is stated, choose it: 'holding-hands' if hands
+    hold (`holds`), else 'soft-finger' under a drivable time law, else 'paper'."""
     pads = "soft-finger" if law.is_drivable else "paper"
     usual = _known_allocation(table, "allocation", "holding-hands" if holds else pads)
     own = _known_allocation(table, "drivable_allocation", usual)
@@ -181,9 +181,8 @@ def _fixed(table: TableReader, key: str) -> Waypoint:
 
 
 def _waypoints(table: TableReader, names: Sequence[str]) -> list[Waypoint]:
-    """Read an entry of the file: one fixed waypoint, or `count` free waypoints with the same
-    bounds.
-    """
+    """Read one entry of the waypoints: a fixed one, or `count` free ones with equal bounds. `names`
+    are the keys of a pose's six numbers."""
     if table.has("fixed"):
         pose = table.vector("fixed", quantity.POSE)
         table.refuse("fixed", ("lower", "upper", "count"))
@@ -208,9 +207,8 @@ def _waypoints(table: TableReader, names: Sequence[str]) -> list[Waypoint]:
 
 
 def _read_initial(table: TableReader, free: list[Waypoint], names: Sequence[str]) -> Array:
-    """Read the initial free waypoints (n_free, 6) [m, rad]. The default is the middle of the
-    bounds.
-    """
+    """Read the initial poses (n_free, 6) of the waypoints `free` [m, rad], by default the middle of
+    their bounds. `names` are the keys of a pose's six numbers."""
     value = table.raw("initial", None)
     path, problems = table.at("initial"), table.problems
     if value is None:

@@ -63,13 +63,15 @@ class RobotModel:
 
     @cached_property
     def following(self) -> tuple[int, ...]:
-        """Indices in q of the six joints that follow the box."""
+        """Indices in q of the six joints that make the flange follow the box; the other joints are
+        redundant."""
         set_apart = [joint for joint, _ in self.redundant]
         return tuple(k for k in range(self.n_joints) if k not in set_apart)
 
     @cached_property
     def turning(self) -> tuple[bool, ...]:
-        """For each joint True if it is revolute, False if it is prismatic."""
+        """(n,) booleans in the order of q: True for a revolute joint, False for a prismatic
+        joint."""
         return turning_joints(self.model)
 
     def with_redundant(self, q: Expression, extended: Expression) -> Expression:
