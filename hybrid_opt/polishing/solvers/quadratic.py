@@ -50,9 +50,10 @@ Ending = Literal["solved", "infeasible", "failed"]
 
 @dataclass(frozen=True)
 class BorderedMatrix:
-    """A symmetric matrix (k + n, k + n) of k border variables followed by n chain variables.
+    """A symmetric matrix (k + n, k + n) whose last n rows and columns form a tridiagonal block.
 
-    The block of the chain is tridiagonal.
+    It couples k variables, the border, with all variables. The other n variables, the chain, are
+    coupled only with the border and with their neighbours.
 
     Attributes:
         corner: (k, k) block of the border.
@@ -66,7 +67,12 @@ class BorderedMatrix:
     off: Array
 
     def plus(self, other: BorderedMatrix, weight: float = 1.0) -> BorderedMatrix:
-        """Return this matrix plus `weight` times another one."""
+        """Return the sum of this matrix and a multiple of another one.
+
+        Args:
+            other: the other matrix.
+            weight: factor of the other matrix.
+        """
         return BorderedMatrix(
             self.corner + weight * other.corner,
             self.beside + weight * other.beside,
@@ -104,8 +110,8 @@ class BorderedMatrix:
 
 @dataclass(frozen=True)
 class BorderedRows:
-    """Matrix A (rows, k + n) whose rows have entries in the k border variables and in at most two
-    neighbouring ones of the n chain variables.
+    """A matrix A (rows, k + n) with few entries per row: in the k border variables, and in at most
+    two neighbours of the n chain variables.
 
     Attributes:
         border: (rows, k) entries in the border.
@@ -134,7 +140,7 @@ class BorderedRows:
 
     @cached_property
     def _spread(self) -> sparse.csr_array:
-        """The transpose (n, rows) of the columns of the chain variables."""
+        """The entries of A in the chain variables as a transposed sparse matrix (n, rows)."""
         entries = np.concatenate([self.left, self.right])
         where = np.concatenate([self.column, self.column + 1]), np.tile(np.arange(len(self)), 2)
         return sparse.csr_array((entries, where), shape=(self.n_chain, len(self)))
@@ -168,8 +174,16 @@ class BorderedRows:
 
 
 def _summed(column: NDArray[np.intp], values: Array, n: int) -> Array:
-    """Sum values by column: entry j of the result (n,) is the sum of the values whose column
-    is j."""
+    """Sum values by column.
+
+    Args:
+        column: (m,) column of each value.
+        values: (m,) the values.
+        n: number of columns.
+
+    Returns:
+        (n,) sum of the values of each column.
+    """
     return np.asarray(np.bincount(column, values, n), dtype=float)
 
 
@@ -280,9 +294,9 @@ def solve_by_clarabel(program: QuadraticProgram) -> QuadraticAnswer:
 def convexify(H: BorderedMatrix, A: BorderedRows, b: Array) -> tuple[BorderedMatrix, Array]:
     """Return a convex quadratic model of a Lagrangian.
 
-    The model agrees with the Lagrangian where the active rows are equalities. Squares (A d - b)^2
-    of the active rows are added until the block of the chain is positive definite. Then negative
-    eigenvalues of the border's Schur complement are raised.
+    The model agrees with the Lagrangian where the active rows are equalities. The squares (A d -
+    b)^2 of the active rows are added until the tridiagonal block is positive definite. Then
+    negative eigenvalues of the Schur complement of the first variables, the border, are raised.
 
     Args:
         H: Hessian of the Lagrangian.
