@@ -1,5 +1,5 @@
-"""Least commanded forces that hold every case of an uncertainty, and the price of robustness: the
-forces against the size of the uncertainty, and the largest uncertainty that the arms' forces allow.
+"""Least commanded forces that hold every case of an uncertainty, and the largest uncertainty that
+the arms' forces allow.
 
 The leading arm is position controlled; its normal force follows from the motion. The other arm is
 force controlled; its normal force is commanded beforehand, the same in all cases. The motion and
@@ -13,7 +13,7 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
 from functools import cache, cached_property, partial
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from hybrid_opt.robust.cases import (
     random_cases,
     worst_cases,
 )
-from symbolic.array import Array, Count, Figure, Pair, Row, Shape, evenly
+from symbolic.array import Array, Count, evenly
 from symbolic.contact.model import ContactModel
 from symbolic.contact.registry import command_model
 from symbolic.contact.worst_cases import (
@@ -65,8 +65,6 @@ represents displacements is accurate to 0.3 %."""
 HOLDS = 1e-6
 """Excess of a needed force over the commanded force that counts as rounding, as a share."""
 
-MOST, POINTS = 2.0, 9
-"""Largest multiple of the uncertainty in a price of robustness, and number of multiples."""
 
 CASES = 100_000
 """Number of random cases in which every priced carry is checked."""
@@ -643,73 +641,6 @@ def interpreted_robust_model(workcell: Workcell) -> RobustModel:
         return interpret(make(cell))
 
     return RobustModel(workcell, load)
-
-
-@dataclass(frozen=True)
-class RobustPrice:
-    """Normal forces that hold the box in every case, for one carry and several sizes of the
-    uncertainty.
-
-    Attributes:
-        uncertainty: the workcell's uncertainty.
-        factors: (k,) factors on the uncertainty for which a holding force was found.
-        peak: (k, 2) largest normal force of each robot along the carry for each factor [N].
-        commanded: (2,) largest normal force of each robot for the factor 1 [N].
-        limit: (2,) reference force of each robot [N].
-        largest_factor: largest factor for which the forces stay within the reference forces.
-        check: check of the commanded forces in random cases of the uncertainty.
-    """
-
-    uncertainty: Uncertainty
-    factors: Row
-    peak: Annotated[Array, Shape((None, 2))]
-    commanded: Pair
-    limit: Pair
-    largest_factor: Figure
-    check: SampledCheck
-
-
-def robust_price(
-    model: RobustModel,
-    carry: Carry,
-    rng: np.random.Generator,
-    leader: int = 0,
-    cases: int = CASES,
-    threads: int = 1,
-    points: int = POINTS,
-) -> RobustPrice:
-    """Compute the normal forces that hold the box of a carry in every case, for several sizes of
-    the uncertainty.
-
-    Args:
-        model: computes robust forces of the carry's workcell.
-        carry: the carry.
-        rng: random generator that draws the cases of the check.
-        leader: index of the position-controlled arm.
-        cases: number of random cases.
-        threads: number of threads, 0 for one per core.
-        points: number of factors on the uncertainty.
-
-    Raises:
-        SettingsError: the uncertainty leaves no friction or contact patch.
-    """
-    workcell = model.workcell
-    uncertainty = workcell.uncertainty
-    (_, motion), limit = subsample(carry), workcell.task.reference_force
-    force = model.robust_force(motion, uncertainty, leader)
-    factors = np.linspace(0.0, MOST, points)
-    factors = factors[factors < allowed_factor(workcell, uncertainty)]
-    peak = np.array([model.peak(motion, uncertainty.scaled(f), leader) for f in factors])
-    held = np.isfinite(peak).all(axis=1)
-    return RobustPrice(
-        uncertainty=uncertainty,
-        factors=factors[held],
-        peak=peak[held],
-        commanded=force.peak,
-        limit=limit,
-        largest_factor=model.largest_factor(motion, limit, leader),
-        check=model.check(motion, force, cases, rng, threads),
-    )
 
 
 def subsample(carry: Carry) -> tuple[NDArray[np.intp], BoxMotion]:

@@ -25,13 +25,7 @@ from hybrid_opt.robust.cases import (
     transmitted_share,
     worst_cases,
 )
-from hybrid_opt.robust.force import (
-    BoxMotion,
-    box_motion,
-    motion_inputs,
-    robust_model,
-    tile_motion,
-)
+from hybrid_opt.robust.force import BoxMotion, box_motion, motion_inputs, robust_model, tile_motion
 from symbolic.array import Array
 from symbolic.contact.registry import command_model
 from symbolic.contact.worst_cases import (

@@ -19,13 +19,7 @@ import numpy as np
 from scipy.ndimage import maximum_filter1d
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.robust.force import (
-    HeldMotion,
-    RobustModel,
-    at_standstill,
-    box_motion,
-    robust_model,
-)
+from hybrid_opt.robust.force import HeldMotion, RobustModel, at_standstill, box_motion, robust_model
 from symbolic.array import Array
 from symbolic.contact.registry import command_model
 from symbolic.errors import SettingsError

@@ -35,12 +35,8 @@ from hybrid_opt.job.plan import command_forces, job_model
 from hybrid_opt.job.records import Job
 from hybrid_opt.job.smooth import driven_limits, driven_timing
 from hybrid_opt.progress import Progress
-from hybrid_opt.robust.force import (
-    LARGEST_FACTOR,
-    RobustModel,
-    robust_model,
-    robust_price,
-)
+from hybrid_opt.robust.force import LARGEST_FACTOR, RobustModel, robust_model
+from hybrid_opt.robust.price import robust_price
 from hybrid_opt.robust.squeeze import SqueezeSettings
 from hybrid_opt.store.bundle_file import read_manifest
 from hybrid_opt.store.files import read_bytes, to_json

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from hybrid_opt.display.table import UNPUBLISHED
-from hybrid_opt.robust.force import RobustPrice
+from hybrid_opt.robust.price import RobustPrice
 from hybrid_opt.timing.robustness import KILOGRAM_FORCE
 from studies.report.data import ReportData
 from studies.report.drawing import (

@@ -15,7 +15,7 @@ from typing import Literal
 from hybrid_opt.job.records import Job
 from hybrid_opt.recommending.recommendation import Alternative
 from hybrid_opt.robust.cases import LEADER
-from hybrid_opt.robust.force import RobustPrice
+from hybrid_opt.robust.price import RobustPrice
 from hybrid_opt.robust.squeeze import breakdown_text
 from studies.study.recommendation import StoredRecommendation
 

@@ -39,7 +39,8 @@ from hybrid_opt.recommending.recommendation import (
 )
 from hybrid_opt.robust.budget import Remedy, Reserve
 from hybrid_opt.robust.cases import LEADER
-from hybrid_opt.robust.force import RobustPrice, robust_model, robust_price
+from hybrid_opt.robust.force import robust_model
+from hybrid_opt.robust.price import RobustPrice, robust_price
 from hybrid_opt.robust.squeeze import Contribution
 from hybrid_opt.store.files import read_record, to_json, write_json
 from hybrid_opt.store.trajectory_file import write_trajectory

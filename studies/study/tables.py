@@ -15,7 +15,7 @@ from hybrid_opt.campaign.settings import UNION
 from hybrid_opt.display.table import NOTHING, Quantity, Table, counted, number, torque_use
 from hybrid_opt.indicators.statistics import summarise
 from hybrid_opt.metaheuristics.run import title
-from hybrid_opt.robust.force import RobustPrice
+from hybrid_opt.robust.price import RobustPrice
 from hybrid_opt.timing.analysis import ForceCurve, StoredTiming, TimingDocument
 from hybrid_opt.timing.robustness import KILOGRAM_FORCE
 from studies.study.recommendation import StoredRecommendation

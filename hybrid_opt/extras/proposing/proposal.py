@@ -23,14 +23,9 @@ from hybrid_opt.display import table
 from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.extras.proposing.bases import base_choices
 from hybrid_opt.extras.proposing.bounds import Bounds, Sampling
+from hybrid_opt.extras.proposing.closed_chain import ChainConfiguration
 from hybrid_opt.extras.proposing.draft import Draft, changes, decision_bounds
-from hybrid_opt.extras.proposing.planner import (
-    ChainConfiguration,
-    Corridor,
-    plan,
-    search_subspace,
-    straight_paths,
-)
+from hybrid_opt.extras.proposing.planner import Corridor, plan, search_subspace, straight_paths
 from hybrid_opt.extras.proposing.problem import Problem, read_problem
 from hybrid_opt.extras.proposing.remedies import REMEDY_SECONDS, remedies_text
 from hybrid_opt.extras.proposing.setup import Pair, Setup, no_path, prepare

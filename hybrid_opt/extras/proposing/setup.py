@@ -14,6 +14,7 @@ import numpy as np
 
 from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.evaluate.explanation import missing_reach
+from hybrid_opt.extras.proposing.closed_chain import ChainConfiguration, ClosedChain
 from hybrid_opt.extras.proposing.common import common_positions
 from hybrid_opt.extras.proposing.holding import (
     GUIDES,
@@ -27,7 +28,7 @@ from hybrid_opt.extras.proposing.holding import (
     possible_spins,
 )
 from hybrid_opt.extras.proposing.kinematics import REACHED, ArmKinematics, rotate_about_normal
-from hybrid_opt.extras.proposing.planner import ChainConfiguration, ClosedChain, Retreats, retreats
+from hybrid_opt.extras.proposing.planner import Retreats, retreats
 from hybrid_opt.extras.proposing.problem import Problem
 from hybrid_opt.extras.proposing.trial import MARGINS, PoseJudge, judge_of
 from hybrid_opt.robust.budget import budget_text

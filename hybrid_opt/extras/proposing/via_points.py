@@ -7,16 +7,16 @@ from itertools import pairwise
 
 import numpy as np
 
-from hybrid_opt.extras.proposing.kinematics import JUMP
-from hybrid_opt.extras.proposing.planner import (
+from hybrid_opt.extras.proposing.closed_chain import (
     PATH_STEP,
     ChainConfiguration,
     ClosedChain,
     distance,
     metric_weights,
-    same,
     straight,
 )
+from hybrid_opt.extras.proposing.kinematics import JUMP
+from hybrid_opt.extras.proposing.planner import same
 from symbolic.array import Array
 from symbolic.path.spline import path_basis
 from symbolic.records import POSE_SIZE

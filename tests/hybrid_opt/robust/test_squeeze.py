@@ -10,14 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.robust.force import (
-    SAMPLES,
-    BoxMotion,
-    RobustModel,
-    robust_model,
-    robust_price,
-    subsample,
-)
+from hybrid_opt.robust.force import SAMPLES, BoxMotion, RobustModel, robust_model, subsample
+from hybrid_opt.robust.price import robust_price
 from hybrid_opt.robust.squeeze import (
     UNCERTAINTY_SOURCES,
     Squeeze,

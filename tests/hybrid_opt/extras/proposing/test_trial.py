@@ -12,16 +12,10 @@ import pytest
 import trimesh
 
 from hybrid_opt.errors import JobError
+from hybrid_opt.extras.proposing.closed_chain import ChainConfiguration, straight
 from hybrid_opt.extras.proposing.draft import Draft, changes
 from hybrid_opt.extras.proposing.kinematics import ArmKinematics
-from hybrid_opt.extras.proposing.planner import (
-    ChainConfiguration,
-    Corridor,
-    plan,
-    search_subspace,
-    straight,
-    straight_paths,
-)
+from hybrid_opt.extras.proposing.planner import Corridor, plan, search_subspace, straight_paths
 from hybrid_opt.extras.proposing.problem import read_problem
 from hybrid_opt.extras.proposing.proposal import ProposeSettings
 from hybrid_opt.extras.proposing.proposal import _Search as Search

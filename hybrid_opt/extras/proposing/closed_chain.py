@@ -1,0 +1,355 @@
+"""The closed chain of both arms and the box that they hold.
+
+Its free coordinates are the box pose and the redundant joints. The six other joints of each arm
+follow by Newton's method from the pose before, so an arm never changes its branch.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+from hybrid_opt.extras.proposing.holding import LIMIT_MARGIN, Hold
+from hybrid_opt.extras.proposing.kinematics import JUMP, REACHED, TRACKING_STEPS, ArmKinematics
+from hybrid_opt.extras.proposing.trial import PoseJudge
+from symbolic.array import Array
+from symbolic.records import POSE_SIZE, Workcell
+from symbolic.records.poses import box_placement, inverse
+
+PATH_STEP = 0.02
+"""Distance between configurations that are checked along a path [m], as `distance` measures it."""
+
+LEVER = 0.3
+"""Length that a rotation of the box by a radian counts in a distance [m]."""
+
+REDUNDANT_LEVER = 0.2
+"""Length that a motion of a redundant joint by a radian counts in a distance [m]."""
+
+TOGETHER = 8
+"""Number of configurations that are checked together."""
+
+CHAIN_RESIDUAL = 1e-6
+"""Largest pose residual of a closed chain [m, rad]."""
+
+CHAIN_NEWTON_STEPS = 8
+
+MATCH = 1e-3
+"""Largest difference of joints where two trees meet [rad]: both arms are then on the same
+branch."""
+
+
+@dataclass(frozen=True, eq=False)
+class ChainConfiguration:
+    """Box pose and joint positions of both arms while both hold the box.
+
+    Attributes:
+        extended: (6 + m,) extended pose: the box pose [m, rad] followed by the m redundant joints
+            [rad or m].
+        q: joint positions (joints,) of each arm [rad or m].
+    """
+
+    extended: Array
+    q: tuple[Array, Array]
+
+
+class _Follower:
+    """Numeric kinematics by Pinocchio of an arm that follows the box with a fixed pad rotation."""
+
+    def __init__(self, many: ArmKinematics, hold: Hold, model: pin.Model) -> None:
+        robot = many.workcell.robots[many.arm]
+        self.name, self.model, self.many = robot.name, model, many
+        self.data = self.model.createData()
+        self.names = list(self.model.names)[1:]
+        self.last = self.model.njoints - 1
+        self.redundant = many.workcell.task.redundant_places[many.arm]
+        self.T_box_joint = many.held(hold.spin)
+        self.T_root_world = inverse(robot.T_world_base)
+        key = f"robots[{many.arm}].min_manipulability = {robot.min_manipulability:g} m^3"
+        self.singular = f"{robot.name} is near a singular posture ({key})"
+        self.side = many.side(hold.q_start)
+        self.lower, self.upper = many.lower + LIMIT_MARGIN, many.upper - LIMIT_MARGIN
+
+    def close(self, T_world_box: Array, extended: Array, q: Array) -> Array | str:
+        """Find the joint positions near q with which the arm holds the box.
+
+        Args:
+            T_world_box: (4, 4) pose of the box.
+            extended: (6 + m,) box pose followed by m redundant joints, of which only the joints are
+                used [rad or m].
+            q: (joints,) joint positions at a configuration nearby [rad or m].
+
+        Returns:
+            The joint positions (joints,); or a text that says why there are none.
+        """
+        target = self.T_root_world @ T_world_box @ self.T_box_joint
+        before, q = q, q.copy()
+        for joint, place in self.redundant:
+            q[joint] = extended[place]
+        for _ in range(CHAIN_NEWTON_STEPS):
+            pin.computeJointJacobians(self.model, self.data, q)
+            here = self.data.oMi[self.last]
+            turn = pin.log3(target[:3, :3] @ here.rotation.T)
+            error = np.concatenate([target[:3, 3] - here.translation, turn])
+            J = pin.getJointJacobian(self.model, self.data, self.last, pin.LOCAL_WORLD_ALIGNED)[
+                :, self.many.following
+            ]
+            if error @ error < CHAIN_RESIDUAL**2:
+                break
+            try:
+                step = np.linalg.solve(J, error)
+            except np.linalg.LinAlgError:
+                return self.singular
+            if np.abs(step).max() > JUMP:
+                return f"{self.name} does not reach"
+            q[self.many.following] += step
+        else:
+            return f"{self.name} does not reach"
+        if np.abs(q - before).max() > JUMP:
+            return f"{self.name} does not reach"
+        beyond = np.flatnonzero((q < self.lower) | (q > self.upper))
+        if len(beyond):
+            return f"{self.name}/{self.names[beyond[0]]} is at its limit"
+        if self.side * np.linalg.det(J) < self.many.least:
+            return self.singular
+        return q
+
+
+class ClosedChain:
+    """Kinematics and collision checks of both arms with the box between them, while each pad stays
+    fixed on the box.
+
+    Threads must not share an object.
+
+    Attributes:
+        judge: checker of collisions.
+        looked: number of configurations checked so far.
+        refused: number of configurations at which the arms cannot hold the box, by reason;
+            collisions do not count.
+    """
+
+    def __init__(
+        self,
+        workcell: Workcell,
+        judge: PoseJudge,
+        holds: tuple[Hold, Hold],
+        models: tuple[pin.Model, pin.Model],
+    ) -> None:
+        """Prepare the kinematics of both arms.
+
+        Args:
+            workcell: the cell, with chosen redundant joints.
+            judge: checker of collisions.
+            holds: hold of each arm, of which the rotation of the pad is used.
+            models: Pinocchio model of each arm (`symbolic.read.arms.arm_model`).
+        """
+        self.judge, self.looked = judge, 0
+        self._orientation = workcell.task.orientation
+        self.refused: Counter[str] = Counter()
+        self._arms = [
+            _Follower(ArmKinematics(workcell, arm, judge.geometry.arms[arm]), hold, model)
+            for arm, (hold, model) in enumerate(zip(holds, models, strict=True))
+        ]
+
+    def close(self, extended: Array, q: tuple[Array, Array]) -> ChainConfiguration | None:
+        """Return the configuration in which both arms hold the box at a given pose; None if an arm
+        cannot. Collisions are not checked.
+
+        Args:
+            extended: (6 + m,) box pose [m, rad] followed by the m redundant joints [rad or m].
+            q: joint positions (joints,) of each arm at a configuration nearby [rad or m].
+        """
+        T_world_box = box_placement(self._orientation, extended[:POSE_SIZE])
+        found = []
+        for arm, near in zip(self._arms, q, strict=True):
+            closed = arm.close(T_world_box, extended, near)
+            if isinstance(closed, str):
+                self.refused[closed] += 1
+                return None
+            found.append(closed)
+        return ChainConfiguration(extended, (found[0], found[1]))
+
+    def close_many(
+        self, extended: Array, q: tuple[Array, Array], steps: int = TRACKING_STEPS
+    ) -> tuple[tuple[Array, Array], NDArray[np.bool_]]:
+        """Find the joint positions with which both arms hold the box at n given poses. Collisions
+        are not checked.
+
+        Args:
+            extended: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
+            q: joint positions (n, joints) of each arm from which the solution starts [rad or m].
+            steps: largest number of Newton steps.
+
+        Returns:
+            Joint positions (n, joints) of each arm, and (n,) True where both arms hold the box
+            within their joint limits.
+        """
+        T_world_box = box_placement(self._orientation, extended[:, :POSE_SIZE])
+        closed, found = np.ones(len(extended), dtype=bool), []
+        for arm, near in zip(self._arms, q, strict=True):
+            guess = near.copy()
+            for joint, place in arm.redundant:
+                guess[:, joint] = extended[:, place]
+            there = arm.many.solve(guess, T_world_box @ arm.T_box_joint, steps)
+            closed &= there.residual <= REACHED
+            closed &= arm.side * there.determinant >= arm.many.least
+            closed &= np.all((there.q >= arm.lower) & (there.q <= arm.upper), axis=1)
+            found.append(there.q)
+        return (found[0], found[1]), closed
+
+    def along(self, begin: ChainConfiguration, path: Array) -> Iterator[ChainConfiguration]:
+        """Yield the configurations along a path, up to the first that collides or at which an arm
+        cannot hold the box.
+
+        Args:
+            begin: configuration at the first pose of the path.
+            path: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
+        """
+        batch: list[ChainConfiguration] = []
+        place: ChainConfiguration | None = begin
+        for extended in path:
+            assert place is not None
+            place = self.close(extended, place.q)
+            self.looked += 1
+            if place is not None:
+                batch.append(place)
+            if place is None or len(batch) == TOGETHER:
+                free = self._free(batch)
+                yield from batch[:free]
+                if place is None or free < len(batch):
+                    return
+                batch = []
+        yield from batch[: self._free(batch)]
+
+    def along_many(
+        self, begins: Sequence[ChainConfiguration], paths: Array
+    ) -> list[list[ChainConfiguration]]:
+        """Follow k paths at once, each up to its first configuration that collides or at which an
+        arm cannot hold the box.
+
+        Args:
+            begins: configuration at the beginning of each path.
+            paths: (k, n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m];
+                neighbours are at most `PATH_STEP` apart.
+
+        Returns:
+            Configurations along each path, the one in `begins` first.
+        """
+        found = [[begin] for begin in begins]
+        alive = np.arange(len(begins))
+        q = np.array([begin.q[0] for begin in begins]), np.array([begin.q[1] for begin in begins])
+        step = np.zeros_like(q[0]), np.zeros_like(q[1])
+        for extended in paths.transpose(1, 0, 2)[1:]:
+            there, on = self.close_many(extended[alive], (q[0] + step[0], q[1] + step[1]))
+            step = there[0] - q[0], there[1] - q[1]
+            on &= np.max(np.abs(np.hstack(step)), axis=1) <= JUMP
+            alive, q = alive[on], (there[0][on], there[1][on])
+            step = step[0][on], step[1][on]
+            for row, k in enumerate(alive.tolist()):
+                found[k].append(ChainConfiguration(extended[k], (q[0][row], q[1][row])))
+            if not len(alive):
+                break
+        self.looked += sum(map(len, found)) - len(found)
+        return [[one[0], *one[1 : 1 + self._free(one[1:])]] for one in found]
+
+    def between(
+        self, first: ChainConfiguration, last: ChainConfiguration, path: Array
+    ) -> list[ChainConfiguration] | None:
+        """Return the configurations along a path from one configuration to another; None if one of
+        them collides or an arm cannot hold the box, or if the joints do not arrive at `last`.
+
+        Args:
+            first: configuration at the first pose of the path.
+            last: configuration at the last pose of the path.
+            path: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
+        """
+        share = np.linspace(0.0, 1.0, len(path))[:, None]
+        near = [(1.0 - share) * a + share * b for a, b in zip(first.q, last.q, strict=True)]
+        q, closed = self.close_many(path, (near[0], near[1]), CHAIN_NEWTON_STEPS)
+        self.looked += len(path)
+        whole = np.hstack(q)
+        joined = np.abs(np.diff(whole, axis=0)).max(initial=0.0) <= JUMP
+        arrives = np.abs(whole[-1] - np.concatenate(last.q)).max() < MATCH
+        begins = np.abs(whole[0] - np.concatenate(first.q)).max() < MATCH
+        if not (closed.all() and joined and begins and arrives):
+            return None
+        places = [ChainConfiguration(each, (q[0][k], q[1][k])) for k, each in enumerate(path)]
+        free = self._free(places[1:-1]) == len(places) - 2
+        return [first, *places[1:-1], last] if free else None
+
+    def reach(self, begin: ChainConfiguration, extended: Array) -> ChainConfiguration | None:
+        """Return the configuration at the end of a straight motion; None if the motion is not free
+        of collisions or an arm cannot follow it.
+
+        Args:
+            begin: configuration at the beginning of the motion.
+            extended: (6 + m,) box pose at the end [m, rad] followed by the m redundant joints [rad
+                or m].
+        """
+        found = self.way(begin, straight(begin.extended, extended))
+        return None if found is None else found[-1]
+
+    def way(self, begin: ChainConfiguration, path: Array) -> list[ChainConfiguration] | None:
+        """Return the configurations along a whole path; None if one of them collides or an arm
+        cannot hold the box there.
+
+        Args:
+            begin: configuration at the first pose of the path.
+            path: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
+        """
+        found = [begin, *self.along(begin, path[1:])]
+        return found if len(found) == len(path) else None
+
+    def _free(self, places: list[ChainConfiguration]) -> int:
+        """Count the configurations before the first one that collides; all if none does.
+
+        Args:
+            places: configurations along a path.
+        """
+        if not places:
+            return 0
+        pose = np.array([place.extended[:POSE_SIZE] for place in places])
+        q_1, q_2 = (np.array([place.q[arm] for place in places]) for arm in (0, 1))
+        hit = self.judge.colliding(pose, q_1, q_2)
+        return int(np.argmax(hit)) if hit.any() else len(places)
+
+
+def metric_weights(size: int) -> Array:
+    """Return the factors (size,) that turn a box pose followed by redundant joints into lengths: 1
+    for positions, a lever [m/rad] for angles and for redundant joints.
+
+    Args:
+        size: number of entries, 6 plus the number of redundant joints.
+    """
+    found = np.full(size, REDUNDANT_LEVER)
+    found[:3], found[3:POSE_SIZE] = 1.0, LEVER
+    return found
+
+
+def distance(first: Array, second: Array) -> float:
+    """Compute the distance [m] between two box poses with redundant joints, weighted by
+    `metric_weights`.
+
+    Args:
+        first: (6 + m,) box pose [m, rad] followed by the m redundant joints [rad or m].
+        second: (6 + m,) another such vector.
+    """
+    return float(np.linalg.norm(metric_weights(len(first)) * (second - first)))
+
+
+def straight(first: Array, second: Array) -> Array:
+    """Interpolate linearly between two box poses with redundant joints.
+
+    Args:
+        first: (6 + m,) box pose [m, rad] followed by the m redundant joints [rad or m].
+        second: (6 + m,) another such vector.
+
+    Returns:
+        (n, 6 + m) vectors, both ends included, neighbours at most `PATH_STEP` apart.
+    """
+    n = max(int(np.ceil(distance(first, second) / PATH_STEP)), 1)
+    return np.asarray(np.linspace(first, second, n + 1))
