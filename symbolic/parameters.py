@@ -288,8 +288,8 @@ class CellParameters(WorkcellParameters):
 
 
 def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
-    """Return a cell's description in which every parameter is replaced by what `take` returns for
-    it.
+    """Return a cell's description in which `take` has replaced every parameter by a placeholder or
+    a symbol.
 
     Values that no formula uses become constants.
     """
@@ -410,13 +410,13 @@ def _split(T: Array) -> tuple[Array, Array]:
 
 
 def _turn(take: _Take, group: str, path: str, rotation: Array) -> Any:
-    """Return the rotation of a robot's base with its parameters replaced by symbols.
+    """Return the rotation of a robot's base with its parameters replaced.
 
     These are cosine and sine of one angle for an upright base, all entries for a tilted base.
 
     Args:
-        take: function that replaces a value of a group by symbols.
-        group: parameter group.
+        take: replaces a parameter by a placeholder or a symbol.
+        group: name of the parameter group.
         path: key path of the robot.
         rotation: (3, 3) rotation of the base.
     """
@@ -495,7 +495,8 @@ def _joint(take: _Take, joint: RedundantJoint) -> NumberedJoint:
 
 
 def _screen(take: _Take, screen: Screen) -> Screen:
-    """Return the numbers for distance bounds with every parameter replaced by what `take` returns.
+    """Return the numbers for distance bounds in which `take` has replaced every parameter by a
+    placeholder or a symbol.
 
     Shapes of links and of meshes remain unchanged, as part of the topology.
     """
@@ -539,10 +540,10 @@ def _body(take: _Take, path: str, body: ScreenBody) -> Any:
 
 
 def _own(take: _Take, path: str, value: Any) -> Any:
-    """Return a record with every array replaced by symbols, in the order of the fields.
+    """Return a record in which every array is replaced as a parameter, in the order of the fields.
 
     Args:
-        take: function that replaces a value of a group by symbols.
+        take: replaces a parameter by a placeholder or a symbol.
         path: key path of the record.
         value: the record, or a tuple or array in it.
     """

@@ -409,12 +409,13 @@ def _controller(workcell: Workcell, options: argparse.Namespace) -> str:
 
 
 def _timed(cell: Cell, x: Array, options: argparse.Namespace) -> Carry:
-    """Compute a carry with the timing of an exported job.
+    """Compute a carry with the timing that the options request, by default the timing of an
+    exported job.
 
     Args:
         cell: the cell.
         x: (n_var,) decision vector.
-        options: parsed command line, with the limits of the timing.
+        options: parsed command line.
     """
     model = cell.timing_model
     if options.planned_limit is not None:

@@ -126,7 +126,7 @@ def frames(geometry: CellGeometry, film: Film) -> Iterator[NDArray[np.uint8]]:
 
     Args:
         geometry: geometry of the cell.
-        film: motion, view and size of the animation.
+        film: the motion to animate.
     """
     cell = CutCell.of(geometry, cell_solids(geometry))
     points = motion_points(geometry, film.pose, film.q)

@@ -183,7 +183,7 @@ def _legend(edge: str, place: float, size: int) -> Plot:
 
 
 def limits(points: Array, share: float = LOOK_MARGIN) -> list[list[float]]:
-    """Return least and largest value of both axes such that points are visible.
+    """Return plotly's ranges [least, largest] of both axes, such that points are visible.
 
     Args:
         points: (k, 2) the points.

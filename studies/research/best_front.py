@@ -64,7 +64,8 @@ def compute_reference_front(
     jobs: int = 1,
     tell: Callable[[str], None] = lambda text: None,
 ) -> ReferenceFront:
-    """Polish a cell's front from many start candidates, then the union of the results.
+    """Compute a reference front of a cell: polish from many start candidates, then polish the
+    union.
 
     Args:
         evaluator: evaluator of the cell, with the paper's objectives.

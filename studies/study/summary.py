@@ -192,7 +192,7 @@ class AlgorithmFigures:
 
 @dataclass(frozen=True)
 class StoredFront:
-    """The reference front of a campaign: path of its file, number of points and hypervolume."""
+    """File and figures of a campaign's reference front: path, number of points, and hypervolume."""
 
     file: str
     points: Count

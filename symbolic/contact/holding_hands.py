@@ -93,15 +93,16 @@ class HandPatch:
 def required_holding_forces(
     wrench: Expression, friction: Expression, patch: HandPatch
 ) -> tuple[Expression, Expression]:
-    """Compute the least holding force [N] that keeps a hand's rim from lifting off (1), and the
-    least that keeps the hand from sliding (2).
+    """Compute two least holding forces [N]: one keeps a hand's rim from lifting off, one keeps the
+    hand from sliding.
 
-    Both are negative if the load presses the hand onto the payload strongly enough.
+    These are the right sides of (1) and (2) of the module. Both are negative if the load presses
+    the hand onto the payload strongly enough.
 
     Args:
         wrench: (6,) wrench of the hand on the payload about the hand's origin, along the hand's
             axes: tangential force (2,), normal force [N], moments about the two tangents, torsion
-            [N m].
+                [N m].
         friction: Coulomb coefficient of the hand.
         patch: patch of the hand.
     """

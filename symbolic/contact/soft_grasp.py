@@ -55,7 +55,8 @@ class SoftGrasp:
         self.normals = ca.sparsify(ca.DM(normals))
 
     def first(self) -> ca.Function:
-        """Build the function that solves the program for one load.
+        """Build the function that computes the pads' normal forces for one load, by the convex
+        program.
 
         Input: load (6,), force and moment about the box frame's origin, along the box's axes [N, N
         m]. Outputs: normal (2,), normal forces of the robots [N]; slope (6, 2), their derivatives

@@ -29,10 +29,10 @@ _TINY = 1e-12
 
 @dataclass(frozen=True)
 class Softness:
-    """Operations that err to one side; width 0 means exact.
+    """Operations on expressions, such as absolute value or maximum, whose kinks are smoothed.
 
-    Methods with `above` in their name return at least the true value, those with `below` at most
-    the true value.
+    The smoothing errs to a known side: methods with `above` in their name return at least the true
+    value, those with `below` at most the true value. With width 0 they are exact.
 
     Attributes:
         width: width of the kinks of lengths [m].

@@ -247,7 +247,8 @@ def _sorted_pairs(
 def _is_own(first: str, first_stands: bool, second: str, second_stands: bool) -> bool:
     """Return True if only one arm has an influence on the distance of two bodies.
 
-    Both bodies belong to this arm, or one is the payload.
+    Both bodies belong to this arm, or one is the payload and the other is moved by the arm's
+    joints.
 
     Args:
         first, second: groups of the bodies.

@@ -190,7 +190,8 @@ class Screen:
 
 
 def screen_of(geometry: CellGeometry) -> Screen:
-    """Compute the numbers for bounds of distances and motions of a cell's bodies and pairs."""
+    """Compute the numbers of a cell's bodies and pairs, from which distances and motions are
+    bounded."""
     bodies, arms = geometry.bodies, geometry.arms
     pairs = tuple((pair.first, pair.second) for pair in geometry.possible)
     close = close_pairs(geometry)

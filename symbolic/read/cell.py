@@ -435,9 +435,9 @@ def check_uncertainty(workcell: Workcell, problems: Problems) -> None:
 
 
 def check_shapes(workcell: Workcell, problems: Problems) -> None:
-    """Record a problem if the shapes have more convex pieces than allowed.
+    """Record a problem if the cell has more collision shapes than convex pieces are allowed.
 
-    A mesh counts as at least one piece.
+    Each shape has at least one piece.
     """
     most = workcell.collision.most_pieces
     if not problems.clean("collision.most_pieces", *_of_robots("urdf")):

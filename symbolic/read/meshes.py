@@ -138,9 +138,13 @@ def _read(path: Path) -> trimesh.Trimesh:
 
 
 def _is_text(kind: str, content: bytes) -> bool:
-    """Return True if a mesh file of a format `kind` is parsed word by word.
+    """Return True if a mesh file is parsed word by word: an OBJ or OFF, or a PLY in text form.
 
     An STL text counts as False, since only its numbers are parsed.
+
+    Args:
+        kind: format of the file, such as 'obj'.
+        content: content of the file.
     """
     second = content[:1000].split(b"\n", 2)[1:2]
     return kind in ("obj", "off") or (kind == "ply" and b"binary" not in b"".join(second).lower())

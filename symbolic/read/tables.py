@@ -101,7 +101,8 @@ class TableReader:
         return default
 
     def has(self, key: str) -> bool:
-        """Return True if an optional key is present. The key counts as known to `close`."""
+        """Return True if an optional key is present; `close` then does not report the key as
+        unknown."""
         return self.raw(key, None) is not None
 
     def refuse(self, key: str, others: Sequence[str]) -> None:

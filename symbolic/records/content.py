@@ -58,7 +58,9 @@ def _counted(part: bytes) -> bytes:
 @cache
 def _kind(of: type) -> str:
     """Return the name of the rule by which `digest_of_parts` divides values of a type into parts.
-    The result is cached, since it is needed often."""
+
+    The result is cached because it is needed often.
+    """
     if of in (str, int, bool, type(None)):
         return "plain"
     known = {tuple: "tuple", np.ndarray: "array", type: "type", ContentRecord: "content"}

@@ -333,12 +333,15 @@ def row_function(place: PathPointSymbols, constraint: PathConstraint, order: Ord
 
 
 def closure_functions(model: CellModel, arm: int) -> dict[str, ca.Function]:
-    """Build the functions with which an arm's joints follow the box pose, by name. The symbols F, c
-    and nu are those of the module's formulas; the robot's symbolic parameters are the last inputs.
+    """Build the functions with which an arm's joints follow the box pose, by name.
 
-    first: takes pose (6 + m,) with the m redundant joints, and q_reference (n,), joint positions
-    near the solution. It returns q (n,), the joint positions that hold the box; follow (n, 6 + m),
-    the derivative dq/dpose; and pull (n, n), the matrix -F_q^-1, so that nu = pull^T c_q.
+    F(pose, q) = 0 are the equations that fix the joints q (n,) at an extended pose (6 + m,) with m
+    redundant joints; c is a constrained value, and F_q, c_q are derivatives by q. The robot's
+    symbolic parameters are the last inputs.
+
+    first: takes pose, and q_reference (n,), joint positions near the solution. It returns q, the
+    joint positions that hold the box; follow (n, 6 + m), the derivative dq/dpose; and pull (n, n),
+    the matrix -F_q^-1, which gives the multipliers nu = pull^T c_q.
 
     second: takes pose, q and nu (n,). It returns hessian (6 + m + n, 6 + m + n), the second
     derivatives of nu . F by pose and q.

@@ -242,7 +242,7 @@ def _at_samples(
     columns: tuple[int, ...],
     handed: dict[str, ca.MX],
 ) -> ca.MX:
-    """Build the values of a function of the motion at chosen samples, one after the other in a
+    """Build the expression of a quantity that depends on the motion, at chosen samples, as one
     column.
 
     Args:
