@@ -489,7 +489,7 @@ def _compiled(
     """Compile sources in parallel, or take their libraries from the cache unless `rebuild`.
 
     Returns:
-        By the name of the source: the library, and True if it was in the cache.
+        Pairs by the name of the source, library and True if the library was in the cache.
     """
     compiler = compiler_of(cache)
     with ThreadPoolExecutor(available_cores()) as pool, interruptible():

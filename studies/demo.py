@@ -37,8 +37,10 @@ def _add_options(parser: Parser) -> None:
 
 
 def show(options: argparse.Namespace) -> int:
-    """Print a first result, then make the rack's quick study and open its page in a browser if
-    wanted. Return the exit code."""
+    """Print a first result, then make the rack's quick study. Return the exit code.
+
+    The study's page is opened in a browser if the options request it.
+    """
     began = time.monotonic()
     for part in first_result():
         print(f"{part}\n", flush=True)

@@ -299,11 +299,12 @@ def make_study(path: Path, options: argparse.Namespace, with_paper: bool) -> Non
 def campaign_settings(
     options: argparse.Namespace, objectives: tuple[str, ...] = PAPER_OBJECTIVES
 ) -> CampaignSettings:
-    """Return the settings of a campaign in the options of a program; those of the drivable
-    experiment if only a recommendation is wanted.
+    """Return the settings of a campaign from the options of a program.
+
+    If the options request a recommendation only, these are the settings of the drivable experiment.
 
     Args:
-        options: options of the program.
+        options: parsed options of the program.
         objectives: objectives of the search unless the options name others.
 
     Raises:

@@ -82,8 +82,11 @@ def _of(name: str, draw: Callable[..., Figure], *given: Any, caption: str = "") 
 
 
 def report_pictures(data: ReportData) -> Iterator[ReportPicture]:
-    """Yield all pictures for which a report has data: those of the recommended carry, then those of
-    the paper in its order."""
+    """Yield all pictures for which a report has data.
+
+    The pictures of the recommended carry come first, then the paper's pictures in the paper's
+    order.
+    """
     yield from _first_pictures(data)
     if data.reach is not None:
         yield from _paper_pictures(data, data.reach)

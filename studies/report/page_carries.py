@@ -434,14 +434,13 @@ def _uses(
     """Return how much of its torque limit each joint uses at most [%]; None for joints without a
     limit.
 
+    The lists have one entry per joint. The key `torqueUse` is for all loads, `contactTorqueUse` for
+    the contact wrenches alone.
+
     Args:
         workcell: the cell.
         whole: (n, joints) torques of all loads [N m].
         contact: arrays (n, joints) of torques of the contact wrenches, one per phase [N m].
-
-    Returns:
-        Lists with one entry per joint: `torqueUse` for all loads, `contactTorqueUse` for the
-            contact wrenches alone.
     """
     torques = {"torqueUse": whole, "contactTorqueUse": np.concatenate(contact)}
     return {name: _rounded(joint_torque_use(workcell, each), 3) for name, each in torques.items()}

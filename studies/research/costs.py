@@ -90,7 +90,7 @@ def benchmark(
         seed: seed of the candidates.
 
     Returns:
-        Figures by name: the cell, the machine and times in milliseconds per candidate.
+        Facts on cell and machine, and times in milliseconds per candidate, by name.
 
     Raises:
         CodegenError: there is no compiler.

@@ -225,14 +225,13 @@ def with_collisions(
 def shares(evaluator: CandidateEvaluator, batches: Array, repeats: int) -> dict[str, float]:
     """Measure the shares of two parts of the compiled evaluation in its time.
 
+    The key 'candidate' is for path, arms, forces and objectives, 'collisions' for bounds, proofs
+    and FCL.
+
     Args:
         evaluator: evaluator of the cell.
         batches: (n, size, n_var) candidates.
         repeats: number of rounds with each batch.
-
-    Returns:
-        Shares by name: 'candidate' for path, arms, forces and objectives; 'collisions' for bounds,
-            proofs and FCL.
     """
     ways: dict[str, Evaluate] = {
         "whole": evaluator.evaluate,

@@ -364,8 +364,9 @@ def _force_table(
 ) -> ForceTable:
     """Compute the table of shortest durations [s]: a row per path, a column per commanded force.
 
-    The forces are those of `table_forces` and that of the recommended carry. The rows are the
-    hand-made path, the recommended path, further paths, and the best of the front at each force.
+    The forces are the results of `table_forces` and the force of the recommended carry. The rows
+    are the hand-made path, the recommended path, further paths, and the best of the front at each
+    force.
 
     Args:
         cell: the drivable cell.

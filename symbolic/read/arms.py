@@ -420,7 +420,7 @@ class ArmLinks:
 def one_machine(robots: Arms) -> bool:
     """Return True if two robots are arms of one machine.
 
-    Their chains are in one description, at one base pose.
+    Their joints are in one description, at one base pose.
     """
     first, second = robots
     return (
@@ -453,8 +453,7 @@ UNMOVED = "universe"
 
 
 def common_joints(robots: Arms) -> tuple[str, ...]:
-    """Return the joints that move both arms of one machine, in the order of the first arm's
-    chain."""
+    """Return the names of the joints that move both arms of one machine, from the root outwards."""
     if not one_machine(robots):
         return ()
     first, second = (tuple(arm_model(robot).names)[1:] for robot in robots)

@@ -53,8 +53,8 @@ class DrivenLayout(BlockLayout):
 
 
 def driven_layout(workcell: Workcell) -> DrivenLayout:
-    """Return the layout of the limited quantities of a workcell at one point of a driven path. All
-    quantities except force and load are divided by their limits.
+    """Return the layout of the limited quantities of a workcell at one point of a path that
+    robots drive. All quantities except force and load are divided by their limits.
 
     Blocks, in order:
 
@@ -100,7 +100,7 @@ def planned_branches(workcell: Workcell) -> Array:
 
 
 def driven_functions(model: CellModel) -> dict[str, ca.Function]:
-    """Build the functions of the limited quantities at one point of a driven path, by name.
+    """Build, by name, the functions of limited quantities at one point of a path that robots drive.
 
     The variables y are, in order: pose, first and second, the extended pose and its derivatives by
     u (6 + m,); q_1 and q_2, the joints of both arms; a = u''; w = u'^2. Each function takes them as
