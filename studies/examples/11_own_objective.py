@@ -13,13 +13,7 @@ import hybrid_opt as ho
 
 
 def height(outputs: Mapping[str, np.ndarray], workcell: ho.Workcell) -> np.ndarray:
-    """Compute the largest height of the box over twice its height at the goal, one value per
-    candidate.
-
-    Args:
-        outputs: results of the evaluation by name, with one entry per candidate.
-        workcell: the cell.
-    """
+    """Return the box's largest height over twice its height at the goal, one per candidate."""
     goal = workcell.task.waypoints[-1].lower[2]
     return np.asarray(outputs["pose"][:, :, 2].max(axis=1) / (2.0 * goal))
 
