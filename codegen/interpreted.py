@@ -70,9 +70,8 @@ class InterpretedFunction(NumericFunction):
                 array[k] = one
 
     def _evaluator(self, inputs: Sequence[Array], outputs: Sequence[Array]) -> Callable[[], None]:
-        """Return a call without arguments that evaluates the function from `inputs` into
-        `outputs`.
-        """
+        """Return a function without arguments that evaluates from the arrays `inputs` into
+        `outputs`."""
         buffer, evaluate = self.function.buffer()
         for i, array in enumerate(inputs):
             buffer.set_arg(i, array.data)

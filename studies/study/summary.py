@@ -325,8 +325,8 @@ exact test can reach, 2 / binomial(2 n, n), is 0.028 or more before any correcti
 
 
 def reference_front(fronts: Sequence[Array]) -> Array:
-    """Return the non-dominated points (k, n_obj) of the union of fronts, each (n, n_obj). From all
-    fronts of a campaign follows the reference of the IGD."""
+    """Return the non-dominated points (k, n_obj) of the union of fronts, each (n, n_obj). The union
+    of all fronts of a campaign gives its reference front for the IGD."""
     return metrics.front_of(np.concatenate(fronts))
 
 

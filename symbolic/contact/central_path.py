@@ -137,8 +137,8 @@ class Patch(ABC):
 
     @abstractmethod
     def potential(self, state: ca.SX) -> ca.SX:
-        """Compute the value of the barrier at a state (n,). Minus its gradient times the weight
-        gives the multipliers of `centred`."""
+        """Compute the value (scalar) of the cone's barrier function at a state (n,). Its gradient
+        times minus the weight gives the multipliers of `centred`."""
 
     @abstractmethod
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
@@ -151,7 +151,8 @@ class Patch(ABC):
         negative outside."""
 
     def barrier(self, state: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """Compute the barrier's gradient (n,) and Hessian (n, n) by the state at a state (n,)."""
+        """Compute gradient (n,) and Hessian (n, n) of the cone's barrier function at a
+        state (n,)."""
         symbol = ca.SX.sym("state", self.state_size)
         curvature, slope = ca.hessian(self.potential(symbol), symbol)
         found = ca.substitute([ca.densify(slope), curvature], [symbol], [state])

@@ -342,7 +342,7 @@ class MeshReader:
         self.known: dict[tuple[Path, tuple[float, ...]], CutMesh] = {}
 
     def hulls(self, mesh: Mesh) -> tuple[Hull, ...]:
-        """Return the convex pieces of a mesh.
+        """Read a mesh, or look it up, and return its convex pieces in the mesh's frame.
 
         Raises:
             CollisionModelError: the mesh cannot be read or decomposed, or all meshes so far have

@@ -36,7 +36,7 @@ Positions = tuple[tuple[str, float], ...]
 
 
 def chain_joints(urdf: Urdf, root: str, tip: str) -> tuple[str, ...]:
-    """Return the moving joints between two links, from the root to the tip.
+    """Return the names of the moving joints between two links, from the root to the tip.
 
     Args:
         urdf: the description.
@@ -503,9 +503,9 @@ def _is_behind(urdf: Urdf, link: str, joints: Collection[str]) -> bool:
 
 
 def _carriers(robot: Robot) -> dict[str, str]:
-    """Return for each link with shapes the last arm joint before it, by the link's name.
+    """Return the name of the last arm joint before each link with shapes, by the link's name.
 
-    The value is 'universe' for a link that does not move.
+    The name is 'universe' for a link that does not move.
     """
     model = arm_model(robot)
     links = robot_urdf(robot).collisions

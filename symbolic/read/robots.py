@@ -151,7 +151,7 @@ UNKNOWN_TORQUE = "unknown"
 
 @cache
 def _warn_unjudged(robot: str) -> None:
-    """Warn once that a robot's torques are not limited."""
+    """Warn once that the joint torques of the robot called `robot` are not limited."""
     warnings.warn(
         f'robot {robot!r} has torque_max = "{UNKNOWN_TORQUE}": no carry, timing or job is judged '
         "by the torques of its joints, and tables show no use of them",

@@ -182,7 +182,7 @@ def _fixed(table: TableReader, key: str) -> Waypoint:
 
 def _waypoints(table: TableReader, names: Sequence[str]) -> list[Waypoint]:
     """Read one entry of the waypoints: a fixed one, or `count` free ones with equal bounds. `names`
-    are the keys of a pose's six numbers."""
+    are the names of a pose's six numbers, for messages."""
     if table.has("fixed"):
         pose = table.vector("fixed", quantity.POSE)
         table.refuse("fixed", ("lower", "upper", "count"))
@@ -208,7 +208,7 @@ def _waypoints(table: TableReader, names: Sequence[str]) -> list[Waypoint]:
 
 def _read_initial(table: TableReader, free: list[Waypoint], names: Sequence[str]) -> Array:
     """Read the initial poses (n_free, 6) of the waypoints `free` [m, rad], by default the middle of
-    their bounds. `names` are the keys of a pose's six numbers."""
+    their bounds. `names` are the names of a pose's six numbers, for messages."""
     value = table.raw("initial", None)
     path, problems = table.at("initial"), table.problems
     if value is None:

@@ -143,7 +143,8 @@ class PathConstraint(ABC):
         return 0
 
     def numbers(self, place: PathPointSymbols) -> Array:
-        """Return the values (count,) of this constraint's parameters."""
+        """Return the values (count,) of the parameters that distinguish this constraint in its
+        family."""
         return np.zeros(0)
 
     def arms(self, model: CellBodies) -> tuple[int, ...]:
@@ -226,8 +227,8 @@ class JointLimit(PathConstraint):
         return 1 + int(place.q[self.arm].numel())
 
     def numbers(self, place: PathPointSymbols) -> Array:
-        """Return the distance to the limit at zero joint positions, then its derivatives by the
-        joints."""
+        """Return the constraint's parameters (1 + joints,): the distance to the limit at zero joint
+        positions, then its derivatives by the arm's joints."""
         robot = place.model.workcell.robots[self.arm]
         slope = np.zeros(robot.position_lower.shape[0])
         slope[self.joint] = 1.0 if self.side == "lower" else -1.0
