@@ -24,8 +24,9 @@ from symbolic.read.tables import SHAPES
 from symbolic.read.task import MAX_PIECES, MAX_WAYPOINTS
 from symbolic.records import Handling, Payload, Robot, Uncertainty
 from symbolic.records import quantities as quantity
-from symbolic.records.cell import CollisionSettings, Driver, HandKind, Mesh, ToolLoad
+from symbolic.records.cell import CollisionSettings, Driver, HandKind, ToolLoad
 from symbolic.records.poses import Rotation
+from symbolic.records.shapes import Mesh
 from symbolic.records.task import AllowedContact, Task
 from symbolic.records.time_law import TIME_LAWS
 

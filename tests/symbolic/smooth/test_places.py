@@ -19,8 +19,9 @@ from symbolic.functions import candidate_function
 from symbolic.geometry.clearance import screening_functions
 from symbolic.geometry.separation import coal_distance
 from symbolic.path.rotation import rotation_matrix
-from symbolic.records.cell import PAYLOAD_NAME, Box, Workcell
+from symbolic.records.cell import PAYLOAD_NAME, Workcell
 from symbolic.records.poses import Orientation
+from symbolic.records.shapes import Box
 from symbolic.robot.arm import flange_target, manipulability, pose_error
 from symbolic.smooth.passage import (
     PARALLEL_GAP,
