@@ -216,8 +216,14 @@ def _packed(name: str, content: bytes) -> StoredFile:
     if len(content) <= MAX_PLAIN_BYTES:
         with suppress(UnicodeDecodeError):
             return StoredFile(name, checksum, "utf-8", content.decode("utf-8"))
-    packed = base64.b64encode(zlib.compress(content, 9)).decode("ascii")
-    return StoredFile(name, checksum, "zlib+base64", packed)
+    return StoredFile(name, checksum, "zlib+base64", _compressed(content))
+
+
+@lru_cache(maxsize=32)
+def _compressed(content: bytes) -> str:
+    """Return compressed content as base64. A study stores its cell in several trajectories, and
+    the meshes of two robots are 10 MB."""
+    return base64.b64encode(zlib.compress(content)).decode("ascii")
 
 
 def _unpacked(entry: StoredFile, where: str, room: int) -> bytes:
