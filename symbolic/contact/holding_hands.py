@@ -55,6 +55,10 @@ an edge."""
 HAND_PARAMETERS = ("share", "opposed", "weaker")
 """Fields of `NumberedContact` that hands have in addition."""
 
+BALANCES = np.geomspace(1e-3, 1e3, 121)
+"""Weights of the tangential force against the torsion, of which the best bounds a product of both
+to 0.2 %."""
+
 FLOOR = 1e-9
 """Added in squares to forces [N] and moments [N m], so that lengths have derivatives at zero."""
 
@@ -124,15 +128,18 @@ def internal_force_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Arra
     each other.
 
     The push results from an error of the arms' relative pose; the elastic layers of the two arms
-    are springs in series. The result is an upper bound over all directions of the push.
+    are springs in series. A push f, a unit vector, needs g(f) - n . f more of a hand, with n the
+    normal force per newton of push along each axis, and a length g of tilting or of sliding over
+    the friction coefficient. Squared, this is at most max(g)^2 + 2 g(n) + |n|^2 in any direction.
 
     Args:
         pads: the n hands of both arms.
         robots: index of the arm of each hand.
 
     Returns:
-        (n, 3) dimensionless numbers a, b, c for each hand. Against sliding the additional holding
-        force is a / mu + b, with the friction coefficient mu; against lifting off it is c.
+        (n, 4) dimensionless numbers a, b, c, d for each hand. Against sliding the additional
+        holding force is sqrt(a / mu^2 + b / mu + c), with the friction coefficient mu; against
+        lifting off it is d.
     """
     maps, stiff = [wrench_to_box(pad) for pad in pads], [layer_stiffness(pad) for pad in pads]
     wholes = [np.zeros((6, 6)), np.zeros((6, 6))]
@@ -144,12 +151,33 @@ def internal_force_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Arra
     found = []
     for pad, A, K, i in zip(pads, maps, stiff, robots, strict=True):
         own, patch = K @ A.T @ softness[i] @ wrench, HandPatch.of(pad)
-        along, across, torsion = own[:2], own[2:3], own[5:] / float(patch.twist)
-        tilting = own[3:5] / np.array(patch.kern[::-1])[:, None]
-        t, n, m, s = (float(np.linalg.norm(part, 2)) for part in (along, across, tilting, torsion))
-        m *= 1.0 if patch.is_round else np.sqrt(2.0)
-        found.append([np.sqrt(t**2 + s**2 + patch.kappa * t * s), n, m + n])
+        along, n, torsion = own[:2], own[2], own[5] / float(patch.twist)
+        tilting = own[3:5] / np.array(patch.kern[::-1], dtype=float)[:, None]
+        t, s = np.linalg.norm(along @ n), abs(torsion @ n)
+        sliding = np.sqrt(t**2 + s**2 + patch.kappa * t * s)
+        if patch.is_round:
+            most, lifting = np.linalg.norm(tilting, 2), np.linalg.norm(tilting @ n)
+        else:
+            most = max(np.linalg.norm(tilting[0] + sign * tilting[1]) for sign in (1.0, -1.0))
+            lifting = np.abs(tilting @ n).sum()
+        off = np.sqrt(most**2 + 2.0 * lifting + n @ n)
+        found.append([_most_sliding(along, torsion, patch.kappa), 2.0 * sliding, n @ n, off])
     return np.array(found)
+
+
+def _most_sliding(along: Array, torsion: Array, kappa: float) -> float:
+    """Compute the largest |T f|^2 + (s f)^2 + kappa |T f| |s f| of any unit vector f, with
+    `along` T (2, 3) and `torsion` s (3,).
+
+    A product of two lengths is at most half of q times one squared plus the other squared over q,
+    for every q; the least of these bounds is taken.
+    """
+    first, second = along.T @ along, np.outer(torsion, torsion)
+    bounds = (
+        np.linalg.eigvalsh((1.0 + kappa * q / 2.0) * first + (1.0 + kappa / q / 2.0) * second)[-1]
+        for q in BALANCES
+    )
+    return float(min(bounds))
 
 
 class HoldingHands(ContactModel):
@@ -171,7 +199,7 @@ class HoldingHands(ContactModel):
 
     @property
     def pad_parameters(self) -> list[dict[str, Any]]:
-        """One dictionary per hand: its matrix (6, 6) of `layer_shares`, its row (3,) of
+        """One dictionary per hand: its matrix (6, 6) of `layer_shares`, its row (4,) of
         `internal_force_needs`, and the least holding force of all hands over the hand's own."""
         pads = self.workcell.pads
         if isinstance(pads[0], NumberedContact):
@@ -358,6 +386,7 @@ class HoldingHands(ContactModel):
         the arms push against each other."""
         most = ca.SX(0.0)
         for i, own in zip(self.workcell.pad_robots, self.pad_parameters, strict=True):
-            a, b, lifting = ca.vertsplit(ca.vec(number(own["opposed"])))
-            most = ca.fmax(most, own["weaker"] * ca.fmax(a / friction[i] + b, lifting))
+            a, b, c, lifting = ca.vertsplit(ca.vec(number(own["opposed"])))
+            sliding = ca.sqrt(a / friction[i] ** 2 + b / friction[i] + c + FLOOR**2)
+            most = ca.fmax(most, own["weaker"] * ca.fmax(sliding, lifting))
         return most

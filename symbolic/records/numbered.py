@@ -67,7 +67,7 @@ class NumberedContact(Contact):
     Attributes:
         twist, spread: lengths of the patch (`symbolic.contact.soft_finger.SoftPatch`) [m].
         share: for a hand, its matrix (6, 6) of `symbolic.contact.elastic.layer_shares`.
-        opposed: for a hand, its row (3,) of `symbolic.contact.holding_hands.internal_force_needs`.
+        opposed: for a hand, its row (4,) of `symbolic.contact.holding_hands.internal_force_needs`.
         weaker: for a hand, the least holding force of all hands over its own.
     """
 
