@@ -126,7 +126,12 @@ def polished_study(memoise: Once) -> Path:
     def make(folder: Path) -> None:
         # Not imported at the top: the quick tests need none of it.
         from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
-        from hybrid_opt.polishing.settings import FillSettings, PolishSettings, ProbeSettings
+        from hybrid_opt.polishing.settings import (
+            DrivableSettings,
+            FillSettings,
+            PolishSettings,
+            ProbeSettings,
+        )
         from hybrid_opt.progress import Progress
         from studies.programs.study import StudySettings, run_study
         from symbolic.read.cell import load
@@ -135,8 +140,13 @@ def polished_study(memoise: Once) -> Path:
         campaign = CampaignSettings(
             {"nsga2": {"population": 20}}, evaluations=120, replicas=2, seed=4
         )
-        fill, probe = FillSettings(solved=4, members=4, attempts=1), ProbeSettings(2, 2, rounds=2)
-        polish = PolishSettings(attempts=3, rounds=3, fill=fill, probe=probe)
+        polish = PolishSettings(
+            attempts=3,
+            rounds=3,
+            fill=FillSettings(solved=4, members=4, attempts=1),
+            probe=ProbeSettings(2, 2, rounds=2),
+            drivable=DrivableSettings(first_rounds=2, rounds=1, members=2),
+        )
         execution = ExecutionSettings(folder, jobs=1)
         wanted = StudySettings(polish, drivable_replicas=1, report=False)
         run_study(load(RACK), campaign, execution, Progress(shown=False), wanted)

@@ -326,7 +326,7 @@ def long_function(steps: int) -> ca.Function:
     return ca.Function("long_line", [x], [ca.vertcat(*values[-7:]), values[steps // 2]])
 
 
-CUT, LINE = 1000, 300
+CUT, LINE = 500, 150
 """Statements from which on the tests cut, and steps of a function that is longer."""
 
 

@@ -46,7 +46,8 @@ def front() -> ho.Front:
 
 @cache
 def polished() -> ho.Front:
-    fill, probe = FillSettings(attempts=1), ProbeSettings(starts=2, middle_starts=2)
+    fill = FillSettings(solved=8, members=16, attempts=1)
+    probe = ProbeSettings(starts=2, middle_starts=2)
     settings = ho.PolishSettings(attempts=2, rounds=3, fill=fill, probe=probe)
     return ho.polish(front(), rng=np.random.default_rng(1), settings=settings)
 

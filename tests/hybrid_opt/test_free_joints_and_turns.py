@@ -11,6 +11,7 @@ import pytest
 import hybrid_opt as ho
 from hybrid_opt.cell import Cell
 from hybrid_opt.collision.certify import SampledPath, configurations
+from hybrid_opt.compiled_cell import InterpretedCell
 from hybrid_opt.display.scene import scene_data
 from hybrid_opt.display.solids import frame_placements
 from hybrid_opt.evaluate.evaluation import REASONS, LockedEvaluator
@@ -26,7 +27,8 @@ from tests.odd_cells import free_pandas, turned_transfer
 
 @pytest.fixture(scope="module")
 def cell(tmp_path_factory: pytest.TempPathFactory) -> Cell:
-    return Cell(free_pandas(tmp_path_factory.mktemp("pandas"), "initial = 0.1"))
+    workcell = free_pandas(tmp_path_factory.mktemp("pandas"), "initial = 0.1")
+    return Cell(workcell, compiled=InterpretedCell(workcell))
 
 
 def varied(cell: Cell, count: int, spread: float) -> Array:
@@ -98,7 +100,8 @@ def test_locking_is_a_constant_path(cell: Cell) -> None:
 
 @pytest.fixture(scope="module")
 def turned(tmp_path_factory: pytest.TempPathFactory) -> Cell:
-    return Cell(turned_transfer(tmp_path_factory.mktemp("turned")))
+    workcell = turned_transfer(tmp_path_factory.mktemp("turned"))
+    return Cell(workcell, compiled=InterpretedCell(workcell))
 
 
 def test_most_carries_are_feasible_and_certified(turned: Cell) -> None:

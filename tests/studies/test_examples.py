@@ -25,7 +25,7 @@ SMALL = {
     "evaluations=300": "evaluations=60",
     "range(5)": "range(2)",
     "cell.random(500": "cell.random(60",
-    "attempts=60": "attempts=2",
+    "attempts=60": "attempts=1, rounds=1",
     "evaluations=2000": "evaluations=400",
     "curve_points=5": "curve_points=2",
 }

@@ -38,7 +38,8 @@ from tests.symbolic.cells import RACK
 
 SETTINGS = CampaignSettings(algorithms={"nsga2": {}}, evaluations=200, replicas=1, seed=5)
 PROBE = ProbeSettings(starts=2, middle_starts=2, rounds=2)
-POLISHED = PolishSettings(attempts=2, rounds=3, fill=FillSettings(attempts=1), probe=PROBE)
+FILL = FillSettings(solved=8, members=16, attempts=1)
+POLISHED = PolishSettings(attempts=2, rounds=3, fill=FILL, probe=PROBE)
 SILENT = Progress(shown=False)
 
 

@@ -130,7 +130,7 @@ def test_fcl_agrees_with_coal(name: str, n: int, folder: Path) -> None:
 
 
 @CELLS
-@pytest.mark.parametrize("n", [1500, pytest.param(20_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [500, pytest.param(20_000, marks=pytest.mark.slow)])
 def test_screening_changes_nothing(name: str, n: int, folder: Path) -> None:
     """Every sample's verdict and every cleared pair, against FCL on all pairs."""
     judge = checker(name, folder)

@@ -33,7 +33,7 @@ from hybrid_opt.polishing.front import (
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.records import PolishedFront
-from hybrid_opt.polishing.settings import FillSettings, PolishSettings
+from hybrid_opt.polishing.settings import FillSettings, PolishSettings, ProbeSettings
 from studies.research.best_front import read_reference_front
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -44,7 +44,9 @@ from tests.hybrid_opt.polishing.cells import require_progress, smooth_cell
 from tests.refusals import refused
 from tests.symbolic.read.samples import RACK
 
-SETTINGS = PolishSettings(attempts=7, fill=FillSettings(attempts=1))
+SETTINGS = PolishSettings(
+    attempts=4, probe=ProbeSettings(4, 4), fill=FillSettings(solved=12, members=24, attempts=1)
+)
 PATIENT = PolishSettings(rounds=25, max_iterations=80)
 
 SPAN = np.full(2, 0.05)
@@ -147,13 +149,15 @@ def test_with_time_points_become_stationary() -> None:
     machine's arithmetic.
     """
     solver = ForceSolver(smooth_cell(evaluator()), PATIENT)
-    limits, found = [1e-4, 1e-6, OPTIMAL_STATIONARITY], []
+    limits, stationary = [1e-4, 1e-6, OPTIMAL_STATIONARITY], 0
     for x in [initial_decision(evaluator().workcell.task), *start_front()]:
         target = pascoletti_serafini(objectives_of(x[None])[0], SPAN)
         residuals = solver.solve(x, target, radius=1.0).residuals
-        found.append((residuals.stationarity, residuals.feasibility, residuals.complementarity))
-    assert len(found) == 5
-    assert np.all(np.array(found) < limits, axis=1).sum() >= 2
+        found = [residuals.stationarity, residuals.feasibility, residuals.complementarity]
+        stationary += bool(np.all(np.array(found) < limits))
+        if stationary == 2:
+            return
+    pytest.fail(f"{stationary} of {1 + len(start_front())} are stationary")
 
 
 def test_what_it_cost_is_told_in_evaluations() -> None:

@@ -185,8 +185,8 @@ def test_the_cost_of_a_partners_stop_is_told(
 def test_more_payload_takes_more_force(drivable: ho.Cell, front: ho.Front) -> None:
     """In the command, in the job, and by a model of the heavier box that shares nothing with it."""
     box, last = drivable.workcell.payload, 0.0
-    few = ho.Front.of(drivable, front.x[:6])
-    for mass in (7.0, 8.0, 9.0, 10.0, 12.5):
+    few = ho.Front.of(drivable, front.x[:3])
+    for mass in (7.0, 10.0, 12.5):
         found = ho.recommend(few, ho.Wish(payload=mass), alone=True)
         heavier = replace(box, mass=mass, inertia=mass / box.mass * box.inertia)
         model = RobustModel(

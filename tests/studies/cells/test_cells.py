@@ -223,7 +223,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> CellModel:
 
 
 def test_the_model_is_that_of_the_plain_cell(described: Cell, plain: CellModel) -> None:
-    model = described.compiled.model
+    model = build_cell_model(described.workcell)
     assert model.robots[0].joint_names == plain.robots[0].joint_names
     found, expected = (set(map(frozenset, m.geometry.pair_names)) for m in (model, plain))
     assert found == expected

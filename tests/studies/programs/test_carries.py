@@ -115,7 +115,7 @@ def of_a_study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_bundle_is_written(
     of_a_study: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    arguments = [str(of_a_study), "--target", "data", "--output", str(tmp_path)]
+    arguments = [str(of_a_study), "--target", "data", "--step", "0.02", "--output", str(tmp_path)]
     assert export.main(arguments) == 0
     text = capsys.readouterr().out
     for part in ("approach", "set down", "Position control", "warning"):

@@ -6,12 +6,16 @@ import re
 
 import pytest
 
+from hybrid_opt.polishing import settings
 from studies.demo import first_result
 
 pytestmark = pytest.mark.heavy
 
 
-def test_the_first_result_says_what_is_slow_and_what_was_found() -> None:
+def test_the_first_result_says_what_is_slow_and_what_was_found(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(settings, "QUICK_DRIVABLE_ATTEMPTS", 3)
     by_hand, front = first_result(evaluations=100)
     assert re.search(r" (\w+ \w+, )*joint acceleration", by_hand)
     rows = [line.split() for line in front.splitlines() if re.match(r"\d+\.\d ", line)]

@@ -6,6 +6,7 @@ import json
 import re
 import tomllib
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,6 +17,7 @@ import pytest
 import trimesh
 from PIL import Image
 
+import hybrid_opt as ho
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.solids import cell_solids
 from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator
@@ -176,6 +178,7 @@ def test_text_and_json_say_the_same_of_a_short_polish_too(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(inspection, "SHORT_POLISH_ATTEMPTS", 1)
+    monkeypatch.setattr(ho, "PolishSettings", partial(ho.PolishSettings, rounds=1))
     arguments = [str(RACK), "--candidates", "100", "--no-pictures"]
     assert inspect.main([*arguments, "--polish"]) == 0
     said = capsys.readouterr()

@@ -12,6 +12,7 @@ from PIL import Image, ImageSequence
 
 from hybrid_opt import recommend, search
 from hybrid_opt.cell import Cell
+from hybrid_opt.compiled_cell import InterpretedCell
 from hybrid_opt.extras.simulation.reference import Control
 from hybrid_opt.store.trajectory_file import write_trajectory
 from studies import simulate
@@ -119,7 +120,8 @@ def test_hands_hold_the_recommended_carry_over_the_whole_uncertainty(
 @pytest.mark.parametrize("name", ["palletising", "rack"])
 def test_a_controller_of_other_hands_is_refused(tmp_path: Path, name: str) -> None:
     cell, path = Cell.load(RACK.with_name(f"{name}.toml")).drivable(), tmp_path / "carry.json"
-    write_trajectory(path, cell.workcell, cell.initial, {}, {"algorithm": "nsga2"})
+    stored_by = InterpretedCell(cell.workcell)
+    write_trajectory(path, stored_by, cell.initial, {}, {"algorithm": "nsga2"})
     controller = "hands" if name == "rack" else "leader"
     with ended_by("controller", f"--controller {controller}"):
         assert simulate.main([str(path), "--controller", controller]) == 2

@@ -31,10 +31,10 @@ from tests.symbolic.contact.oracle import (
 )
 
 KINDS = (
-    ("round", "round"),
+    pytest.param(("round", "round"), marks=pytest.mark.slow),
     ("round", "rectangle"),
     ("round", "round", "round"),
-    ("rectangle",) * 4,
+    pytest.param(("rectangle",) * 4, marks=pytest.mark.slow),
 )
 
 

@@ -316,7 +316,9 @@ def test_faults_hold_both_arms(name: str, phase: str) -> None:
         assert cell.stream.machine.clock.s == 0.0
 
 
-@pytest.mark.parametrize("stiffness", [1e4, 3e4, 1e5, 3e5])
+@pytest.mark.parametrize(
+    "stiffness", [1e4, *(pytest.param(k, marks=pytest.mark.slow) for k in (3e4, 1e5)), 3e5]
+)
 def test_arms_as_stiff_as_measured_keep_their_force(stiffness: float) -> None:
     cell = Cell(stiffness, stiffness)
     assert cell.run("done", "held") == "done", cell.stream.machine.status()
@@ -331,7 +333,9 @@ def test_arms_as_stiff_as_measured_keep_their_force(stiffness: float) -> None:
     assert most < 1.5
 
 
-@pytest.mark.parametrize("real", [3e4, 1e5, 3e5])
+@pytest.mark.parametrize(
+    "real", [*(pytest.param(k, marks=pytest.mark.slow) for k in (3e4, 1e5)), 3e5]
+)
 def test_arms_stiffer_than_measured_do_not_press_beyond_bounds(real: float) -> None:
     cell = Cell(STIFFNESS, real)
     cell.run("done", "held")
@@ -361,8 +365,8 @@ def measured(cell: Cell, folder: Path) -> tuple[list[Measured], str]:
 @pytest.mark.parametrize(
     ("stiffness", "sign"),
     [
-        (1e4, -1.0),
-        (1e5, 1.0),
+        (1e5, -1.0),
+        pytest.param(1e4, 1.0, marks=pytest.mark.slow),
         pytest.param(3e4, 1.0, marks=pytest.mark.slow),
         pytest.param(3e5, -1.0, marks=pytest.mark.slow),
     ],
