@@ -37,7 +37,6 @@ from hybrid_opt.polishing.point import (
 from hybrid_opt.polishing.rows import Row
 from hybrid_opt.polishing.solvers.base import Residuals
 from hybrid_opt.polishing.solvers.quadratic import (
-    BorderedMatrix,
     QuadraticAnswer,
     QuadraticProgram,
     convexify,
@@ -78,6 +77,9 @@ timing are used."""
 ROW_ROUNDS, ROW_TOLERANCE = 3, 1e-6
 """Number of times that rows are added to one quadratic program, and the predicted excess over a
 limit at which its row is added."""
+
+TIGHT_ROOM = 1e-6
+"""Rows with less room than this at the iterate are active at the start of a first solve."""
 
 MULTIPLIER_CURVATURE = 1.0
 """Curvature along the path variables in the program that finds multipliers."""
@@ -171,6 +173,14 @@ class _StepAnswer:
 
     answer: QuadraticAnswer
     linear: LinearisedRows
+
+    def multipliers_of(self, linear: LinearisedRows) -> Array:
+        """Return the multipliers (n + rows,) of the bounds and of other linearised rows of the same
+        program, 0 for rows that this solution did not have."""
+        timing = np.zeros(linear.shape)
+        timing[self.linear.point, self.linear.kind] = self.answer.rows[: len(self.linear.point)]
+        geometry = self.answer.rows[len(self.linear.point) :]
+        return np.concatenate([self.answer.bounds, timing[linear.point, linear.kind], geometry])
 
 
 class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
@@ -331,16 +341,15 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
             grid, values, best.x, best.squared, self.cell, required, best.carry
         )
         box, chosen = self._box(best, radius), program.near_rows()
-        steady = np.zeros(program.n)
-        steady[: program.n_path] = MULTIPLIER_CURVATURE
-        plain = program.curvature().add_diagonal(steady)
+        plain = program.curvature()
+        plain[np.diag_indices(program.n_path)] = MULTIPLIER_CURVATURE
         first = self._solved(program, chosen, (plain, np.zeros(program.n)), box)
         if first is None:
             return None
         H = program.curvature(first.linear, first.answer.rows)
         active = first.answer.rows > NEGLIGIBLE_MULTIPLIER
-        model = convexify(H, first.linear.A.select(active), first.linear.b[active])
-        second = self._solved(program, chosen, model, box)
+        model = convexify(H, first.linear.A[active], first.linear.b[active])
+        second = self._solved(program, chosen, model, box, first)
         if second is None:
             return None
         residuals = min(
@@ -349,7 +358,7 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         )
         bent = program.geometry_after(second.answer.d)
         if np.abs(bent).max(initial=0.0) > LARGEST_NONLINEARITY:
-            second = self._solved(program, chosen, model, box, bent) or second
+            second = self._solved(program, chosen, model, box, second, bent) or second
         d = second.answer.d
         squared = best.squared.copy()
         squared[1:-1] *= 1.0 + d[program.speeds]
@@ -374,8 +383,9 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         self,
         program: PathTimingProgram,
         chosen: NDArray[np.bool_],
-        model: tuple[BorderedMatrix, Array],
+        model: tuple[Array, Array],
         box: tuple[Array, Array],
+        found: _StepAnswer | None = None,
         bent: Array | float = 0.0,
     ) -> _StepAnswer | None:
         """Solve a quadratic model, and solve it again with the timing rows that the solution
@@ -389,6 +399,8 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
             chosen: (points, kinds) mask of the timing rows in the model.
             model: Hessian, and vector that is added to the objective's gradient.
             box: lower and upper bounds (n,) of the step.
+            found: solution of a similar model, in whose active set the solve starts; None to start
+                with the rows that are tight at the iterate.
             bent: (geometric rows,) error of the rows' linear model along an earlier step, added to
                 the geometric rows.
 
@@ -396,14 +408,15 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
             The last solution with its rows; None if there is no solution.
         """
         g = program.gradient() + model[1]
-        found: _StepAnswer | None = None
         for left in reversed(range(ROW_ROUNDS)):
             linear = program.linear(chosen, bent)
             asked = QuadraticProgram(model[0], g, linear.A, linear.b, *box)
-            answer = solve_quadratic(asked)
+            tight = np.append(np.zeros(program.n), linear.b < TIGHT_ROOM)
+            start = found.multipliers_of(linear) if found else tight
+            answer = solve_quadratic(asked, start)
             if answer is None:
                 # Infeasible within the trust region: rows keep their present violation at most.
-                answer = solve_quadratic(replace(asked, b=np.maximum(linear.b, 0.0)))
+                answer = solve_quadratic(replace(asked, b=np.maximum(linear.b, 0.0)), start)
             if answer is None:
                 return None
             found = _StepAnswer(answer, linear)

@@ -20,7 +20,6 @@ from hybrid_opt.polishing.cell import PolishFunctions, SmoothCell
 from hybrid_opt.polishing.robust import ROBUST_ROWS, RobustForces
 from hybrid_opt.polishing.rows import ConstraintRows, Row, RowLayout
 from hybrid_opt.polishing.solvers.base import Residuals
-from hybrid_opt.polishing.solvers.quadratic import BorderedMatrix, BorderedRows
 from symbolic.array import Array
 from symbolic.contact.registry import contact_model
 from symbolic.limits import LIMITS, limits_of_block
@@ -358,10 +357,10 @@ def _followed(grid: IntervalGrid, full: Array, follow: Sequence[Array]) -> Array
     return slope
 
 
-NEARLY_USED = 0.85
+NEARLY_USED = 0.92
 """Limits with a larger utilisation have a row in the program from the start."""
 
-NEARLY_USED_FORCE = 0.6
+NEARLY_USED_FORCE = 0.8
 """Normal forces above this share of the way from the force at rest to the limit have a row in the
 program from the start."""
 
@@ -386,13 +385,15 @@ class LinearisedRows:
         A, b: matrix and right side of the rows, divided by `scale`.
         scale: (rows,) divisors of the rows.
         point, kind: (timing rows,) index of the point and of the inequality of each timing row.
+        shape: numbers of points and of inequalities at a point.
     """
 
-    A: BorderedRows
+    A: Array
     b: Array
     scale: Array
     point: NDArray[np.intp]
     kind: NDArray[np.intp]
+    shape: tuple[int, int]
 
 
 class PathTimingProgram:
@@ -409,8 +410,7 @@ class PathTimingProgram:
                     `hybrid_opt.polishing.force`.
 
     First and second derivatives are exact. Rows of the timing are scaled so that their slope by
-    omega is around one. Every row has the speeds of one interval only, so matrices have the
-    structure of `hybrid_opt.polishing.solvers.quadratic`, with the speeds as the chain.
+    omega is around one.
 
     Attributes:
         place_rows: geometric rows, in order.
@@ -560,18 +560,15 @@ class PathTimingProgram:
         self._learn(*np.nonzero(chosen & ~self._known))
         point, kind = np.nonzero(chosen)
         m, count = len(point), len(self.geometry)
-        by_speed = self._by_speeds[point, kind]
-        border = np.concatenate([self._by_path[point, kind], self._geometry_slope])
+        by_speed, column = self._by_speeds[point, kind], self.n_path + self._column[point]
+        A = np.zeros((m + count, self.n))
+        A[:, : self.n_path] = np.concatenate([self._by_path[point, kind], self._geometry_slope])
+        A[np.arange(m), column], A[np.arange(m), column + 1] = by_speed.T
         scale = np.ones(m + count)
         scale[:m] = np.maximum(np.abs(by_speed).max(axis=1, initial=0.0), LEAST_SCALE)
-        sides = np.zeros((2, m + count))
-        sides[:, :m] = (by_speed / scale[:m, None]).T
-        column = np.zeros(m + count, dtype=np.intp)
-        column[:m] = self._column[point]
+        A /= scale[:, None]
         b = -np.concatenate([self.rows[point, kind], self.geometry + bent]) / scale
-        left, right = sides
-        A = BorderedRows(border / scale[:, None], column, left, right, len(self.cost))
-        return LinearisedRows(A, b, scale, point, kind)
+        return LinearisedRows(A, b, scale, point, kind, self.rows.shape)
 
     def _learn(self, point: NDArray[np.intp], kind: NDArray[np.intp]) -> None:
         """Compute and store the derivatives of timing rows.
@@ -599,20 +596,22 @@ class PathTimingProgram:
         bent = self.cost_diagonal @ omega**2 / 2.0 + self.cost_beside @ (omega[:-1] * omega[1:])
         return -float(self.cost @ omega + bent)
 
-    def curvature(
-        self, linear: LinearisedRows | None = None, rows: Array | None = None
-    ) -> BorderedMatrix:
-        """Return the Hessian of the objective, or of the Lagrangian.
+    def curvature(self, linear: LinearisedRows | None = None, rows: Array | None = None) -> Array:
+        """Return the Hessian (n, n) of the objective, or of the Lagrangian.
 
         Args:
             linear: linearised rows; None for the objective alone.
             rows: (rows,) multipliers of the linearised rows; None for the objective alone.
         """
-        n_path, n = self.n_path, len(self.cost)
-        corner, beside = np.zeros((n_path, n_path)), np.zeros((n, n_path))
-        diagonal, off = self.cost_diagonal.copy(), self.cost_beside.copy()
+        k = self.n_path
+        H = np.zeros((self.n, self.n))
+        H[k:, k:] = (
+            np.diag(self.cost_diagonal)
+            + np.diag(self.cost_beside, 1)
+            + np.diag(self.cost_beside, -1)
+        )
         if linear is None or rows is None:
-            return BorderedMatrix(corner, beside, diagonal, off)
+            return H
         unscaled, count = rows / linear.scale, len(linear.point)
         timing = np.zeros(self.rows.shape)
         timing[linear.point, linear.kind] = np.where(rows > NEGLIGIBLE_MULTIPLIER, unscaled, 0.0)[
@@ -621,20 +620,21 @@ class PathTimingProgram:
         m = self._grid.moving
         at, local = self._values.curvature((timing / self.scale) @ self._grid.kinds.mix)
         over = self._grid.moved[at]
-        speeds, column = self._local[at], self._column[at]
-        corner += np.tensordot(over, local[:, :m, :m] @ over, ([0, 1], [0, 1]))
+        speeds, column = self._local[at], k + self._column[at]
+        H[:k, :k] = np.tensordot(over, local[:, :m, :m] @ over, ([0, 1], [0, 1]))
         mixed = np.swapaxes(speeds, 1, 2) @ local[:, m:, :m] @ over
         own = np.swapaxes(speeds, 1, 2) @ local[:, m:, m:] @ speeds
         for side in (0, 1):
-            np.add.at(beside, column + side, mixed[:, side])
-            diagonal += np.bincount(column + side, own[:, side, side], n)
-        off += np.bincount(column, own[:, 0, 1], n)[:-1]
+            np.add.at(H[:, :k], column + side, mixed[:, side])
+            for other in (0, 1):
+                np.add.at(H, (column + side, column + other), own[:, side, other])
+        H[:k, k:] = H[k:, :k].T
         weight = unscaled[count : count + len(self.place_rows)]
         if weight.any():
             whole = len(self._spread)
             second = self._places.curvature(weight)[:whole, :whole]
-            corner -= self._spread.T @ second @ self._spread
-        return BorderedMatrix(corner, beside, diagonal, off)
+            H[:k, :k] -= self._spread.T @ second @ self._spread
+        return H
 
     def residuals(self, bounds: Array, linear: LinearisedRows, multipliers: Array) -> Residuals:
         """Compute the optimality residuals of the iterate with the multipliers of a step.
@@ -644,7 +644,7 @@ class PathTimingProgram:
             linear: linearised rows at the iterate.
             multipliers: (rows,) multipliers of these rows.
         """
-        lagrangian = self.gradient() + linear.A.transpose_times(multipliers) + bounds
+        lagrangian = self.gradient() + multipliers @ linear.A + bounds
         products = multipliers * linear.b
         worst = float(max(self.rows.max(), self.geometry.max(initial=-1.0), 0.0))
         product = float(np.abs(products).max(initial=0.0))

@@ -32,4 +32,3 @@ inline void add_products(Matrix &to, const Matrix &left, const Matrix &right) {
 // What `rows.cpp` offers to Python beside the rows.
 py::tuple dense(const py::object &program, double barrier, int wanted, int patience, double tolerance,
                 double feasible);
-py::tuple quadratic(const py::object &program, double tolerance);

@@ -466,7 +466,6 @@ class Rows {
 PYBIND11_MODULE(_native, module) {
   module.doc() = "The polish's programs: their rows, and how they are solved.";
   module.def("dense", &dense);
-  module.def("quadratic", &quadratic);
   py::class_<Rows>(module, "Rows")
       .def(py::init<const py::kwargs &>())
       .def("values", &Rows::values)

@@ -39,8 +39,8 @@ NNLS_ITERATIONS = 30
 
 @cache
 def native() -> Any:
-    """Return the compiled module of `rows.cpp`, `solvers/dense.cpp` and `solvers/quadratic.cpp`. It
-    is the same for every cell and was compiled at installation.
+    """Return the compiled module of `rows.cpp` and `solvers/dense.cpp`. It is the same for every
+    cell and was compiled at installation.
 
     Raises:
         BridgeError: it is missing or cannot be loaded.

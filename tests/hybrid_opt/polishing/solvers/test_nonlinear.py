@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
@@ -16,12 +17,15 @@ from hybrid_opt.polishing.solvers.base import (
     Answer,
     NonlinearProgram,
     estimate_multipliers,
+    native,
     optimality_residuals,
     residuals,
 )
 from hybrid_opt.polishing.solvers.dense import dense
 from hybrid_opt.polishing.solvers.ipopt import ipopt
 from symbolic.array import Array
+from symbolic.errors import BridgeError
+from tests.refusals import refused
 
 Solver = Callable[[NonlinearProgram, int, float], Answer]
 
@@ -213,3 +217,18 @@ def test_multipliers_of_an_optimum_are_found() -> None:
     np.testing.assert_allclose(y, [1.0, 0.0], atol=1e-9)
     np.testing.assert_allclose(bounds, [0.0, 1.0], atol=1e-9)
     np.testing.assert_allclose(cost - A.T @ y + bounds, 0.0, atol=1e-9)
+
+
+@pytest.fixture
+def fresh_native() -> Iterator[None]:
+    """Have the compiled part looked for again, during the test and after it."""
+    native.cache_clear()
+    yield
+    native.cache_clear()
+
+
+@pytest.mark.usefixtures("fresh_native")
+def test_a_missing_module_names_the_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "hybrid_opt.polishing._native", None)
+    with refused(BridgeError, "not-loadable", "pip install -e ."):
+        native()
