@@ -10,7 +10,6 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
 from itertools import accumulate, pairwise
-from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,6 @@ from codegen.function import (
     NativeCall,
     NumericFunction,
     Signature,
-    address,
     available_cores,
     ports,
 )
@@ -68,39 +66,29 @@ class CompiledFunction(NumericFunction):
             loaded.dual_arm_load()
             found = (ctypes.c_longlong * 4)()
             loaded.dual_arm_sizes(found)
-            sizes, n_ports = list(found), len(signature.input_names) + len(self.output_names)
-            self._one = _Driver(loaded.dual_arm_run, sizes, n_ports)
+            sizes = list(found)
+            self._one = _Driver(loaded.dual_arm_run, sizes)
         except AttributeError as error:
             raise cannot_load(self.name, error) from error
-        sizes_of = [8 * prod(shape) for shape in self.output_shapes]
-        self._offsets = list(accumulate(sizes_of, initial=0))[:-1]
+        lengths = [8 * size for size in signature.sizes[len(signature.input_shapes) :]]
+        self._offsets = list(accumulate(lengths, initial=0))[:-1]
         self.lanes, self._shared = 1, [False] * len(signature.input_names)
         self._in_lanes: _Driver | None = None
         if hasattr(loaded, "dual_arm_run_lanes"):
             self._shared = [bool(loaded.dual_arm_shared(k)) for k in range(len(self._shared))]
             self.lanes = int(loaded.dual_arm_lanes())
-            entries = sum(map(prod, (*signature.input_shapes, *self.output_shapes)))
-            sizes[3] = (sizes[3] + entries) * self.lanes
-            self._in_lanes = _Driver(loaded.dual_arm_run_lanes, sizes, n_ports)
+            sizes[3] = (sizes[3] + sum(signature.sizes)) * self.lanes
+            self._in_lanes = _Driver(loaded.dual_arm_run_lanes, sizes)
             if not self._lanes_agree():
                 self.lanes = 1
                 warn_one_lane(self.name, f"lanes and single evaluations differ; {OTHER_COMPILER}")
 
     def _evaluate_block(self, inputs: Sequence[Array], block: NDArray[np.void]) -> None:
-        work = self._one.taken()
-        of_work = work.ports
-        slot = 0
-        for array in inputs:
-            of_work[slot] = address(array)
-            slot += 2
-        base = address(block)
-        for offset in self._offsets:
-            of_work[slot] = base + offset
-            slot += 2
-        status = self._one.function(work.ports_address, work.address, 0, 1)
-        self._one.idle.append(work)
-        if status != _SUCCESS:
-            raise self._failure(status, "")
+        outputs = [block] * len(self._offsets)
+        of_block = ports(self.signature, inputs, [False] * len(inputs), outputs)
+        for k, offset in enumerate(self._offsets, len(inputs)):
+            of_block[2 * k] += offset
+        self._run_chunk(ctypes.addressof(of_block), 0, 1)
 
     def _evaluate_batch(
         self,
@@ -179,11 +167,16 @@ class CompiledFunction(NumericFunction):
     def _run_chunk(self, ports_address: int, begin: int, end: int) -> None:
         several = self.lanes > 1 and end - begin > 1
         driver = self._in_lanes if several and self._in_lanes is not None else self._one
-        work = driver.taken()
+        try:
+            work = driver.idle.pop()
+        except IndexError:
+            work = _Work(driver.sizes)
         status = driver.function(ports_address, work.address, begin, end)
         driver.idle.append(work)
         if status != _SUCCESS:
-            raise self._failure(status, " of the batch")
+            raise CodegenError(
+                f"{self.name}: the function failed at candidate {status} of the batch"
+            )
 
     def _lanes_agree(self) -> bool:
         """Return True if a batch that does not fill the lanes gives the same bits as single
@@ -207,9 +200,6 @@ class CompiledFunction(NumericFunction):
             self._evaluate_batch(own, batched, one, 1, 1)
         return all(map(_same, together, apart))
 
-    def _failure(self, candidate: int, of: str) -> CodegenError:
-        return CodegenError(f"{self.name}: the function failed at candidate {candidate}{of}")
-
 
 class _Driver:
     """One driver of a library, with work memory that calls reuse.
@@ -219,29 +209,23 @@ class _Driver:
             results), work (address of work memory), begin and end. It evaluates the candidates from
             begin to end - 1, and returns the index of the first one that failed, or `_SUCCESS`.
         address: address of the function.
+        sizes: sizes of the work memory of one call.
         idle: work memory that no thread uses at present.
     """
 
-    def __init__(self, function: Any, sizes: Sequence[int], n_ports: int) -> None:
+    def __init__(self, function: Any, sizes: Sequence[int]) -> None:
         function.argtypes = [ctypes.c_void_p] * 2 + [ctypes.c_longlong] * 2
         function.restype = ctypes.c_longlong
         self.function: Callable[[int, int, int, int], int] = function
-        self._sizes, self._n_ports = tuple(sizes), n_ports
+        self.sizes = tuple(sizes)
         self.address = ctypes.cast(function, ctypes.c_void_p).value or 0
         self.idle, self._own = deque[_Work](), threading.local()
-
-    def taken(self) -> _Work:
-        """Return work memory that no other thread uses until it is given back."""
-        try:
-            return self.idle.pop()
-        except IndexError:
-            return _Work(self._sizes, self._n_ports)
 
     @property
     def own(self) -> _Work:
         """Permanent work memory of this thread."""
         if not hasattr(self._own, "work"):
-            self._own.work = self.taken()
+            self._own.work = _Work(self.sizes)
         work: _Work = self._own.work
         return work
 
@@ -249,7 +233,7 @@ class _Driver:
 class _Work:
     """Work memory for one thread at a time, with the addresses that the driver needs."""
 
-    def __init__(self, sizes: Sequence[int], n_ports: int) -> None:
+    def __init__(self, sizes: Sequence[int]) -> None:
         arg, res, iw, w = sizes
         self._memory: list[ctypes.Array[Any]] = [
             (ctypes.c_void_p * (arg + 1))(),
@@ -261,8 +245,6 @@ class _Work:
         addresses[3] += -addresses[3] % _ALIGNMENT
         self._pointers = (ctypes.c_void_p * 4)(*addresses)
         self.address = ctypes.addressof(self._pointers)
-        self.ports = (ctypes.c_longlong * (2 * n_ports))()
-        self.ports_address = ctypes.addressof(self.ports)
 
 
 _warned = False

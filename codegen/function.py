@@ -16,7 +16,9 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Mapping, Sequence
 from copy import copy
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from math import prod
+from operator import mul
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -75,6 +77,11 @@ class Signature:
         """Return the signature as a dictionary of strings and lists, ready for JSON."""
         found: dict[str, Any] = json.loads(json.dumps(asdict(self)))
         return found
+
+    @cached_property
+    def sizes(self) -> tuple[int, ...]:
+        """Number of entries of each input, then of each output, in one evaluation."""
+        return tuple(map(prod, (*self.input_shapes, *self.output_shapes)))
 
     def output_record(self) -> np.dtype[np.void]:
         """Return the structured type that holds all outputs of one evaluation in one block of
@@ -407,7 +414,7 @@ def ports(
     signature: Signature,
     inputs: Sequence[Array],
     batched: Sequence[bool],
-    outputs: Sequence[Array],
+    outputs: Sequence[NDArray[Any]],
 ) -> ctypes.Array[ctypes.c_longlong]:
     """Return the addresses of the arguments and results of a batch, as drivers in C take them.
 
@@ -419,25 +426,16 @@ def ports(
         inputs, outputs: the arrays.
         batched: for each input, True if it has one value per evaluation.
     """
-    steps = [
-        prod(shape) if per_candidate else 0
-        for shape, per_candidate in zip(signature.input_shapes, batched, strict=True)
-    ] + [prod(shape) for shape in signature.output_shapes]
-    found = (ctypes.c_longlong * (2 * len(steps)))()
-    for k, (array, step) in enumerate(zip([*inputs, *outputs], steps, strict=True)):
-        found[2 * k] = address(array)
+    arrays, sizes = [*inputs, *outputs], signature.sizes
+    steps = [*map(mul, sizes, batched), *sizes[len(batched) :]]
+    found = (ctypes.c_longlong * (2 * len(sizes)))()
+    for k, (array, step) in enumerate(zip(arrays, steps, strict=True)):
+        try:
+            found[2 * k] = _address_of(_writable(array))
+        except (TypeError, ValueError):  # read-only or empty
+            found[2 * k] = array.ctypes.data if array.size else 0
         found[2 * k + 1] = step
     return found
-
-
-def address(array: NDArray[Any]) -> int:
-    """Return the address of an array's first entry; 0 of an empty array."""
-    if array.size == 0:
-        return 0
-    try:
-        return _address_of(_writable(array))
-    except TypeError:  # read-only
-        return int(array.ctypes.data)
 
 
 def available_cores() -> int:
