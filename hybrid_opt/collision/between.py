@@ -279,7 +279,7 @@ class Rows:
     """A record of arrays with one row per item. A field may itself be such a record."""
 
     def __getitem__(self, rows: NDArray[np.bool_]) -> Self:
-        return of_rows(lambda values: values[0][rows], [self])
+        return type(self)(*[values[rows] for values in vars(self).values()])
 
 
 AnyRows = TypeVar("AnyRows", bound=Rows)

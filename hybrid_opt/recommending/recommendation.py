@@ -7,7 +7,7 @@ which holds the box in every case of the cell's uncertainty.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
@@ -201,6 +201,80 @@ def recommend(
     """
     wish = wish or Wish()
     cell = wished_cell(front.cell, wish)
+    _require_members(cell, front)
+    named: dict[str, Array] = {} if alone else {HAND_MADE: cell.initial[:-1]} | dict(others or {})
+    with progress_bar(progress, "recommendation", STEPS + len(named)) as advance:
+        rows = spread_rows(front.x[:, :-1])
+        paths = DrivenPaths(cell, front.x[rows, :-1])
+        options = paths.all_options(front.x[rows, -1], lambda: advance(1))
+        goal, budget = Goal.of(wish, cell.workcell), cell.grip_budget
+        why = str(wish)
+        if not wish.has_target and not any((each.force <= goal.hardest).all() for each in options):
+            goal = replace(goal, hardest=np.full(2, np.inf))
+            why = f"{wish}, of carries that all exceed the reference force"
+        refuse(options, wish, goal, budget)
+        option, timing, is_kept = _driven(cell, paths, options, goal, wish.has_target)
+        if not is_kept:
+            why = "least excess over the reference force of the carries that were driven"
+        advance(1)
+        carry, limits = timing.carry, cell.timing_model.carry_limits
+        assert carry is not None, "what is recommended has a timing"
+        held = command_forces(job_model(cell.timing_model), timing)
+        forces, squeeze, job, doubts = held.forces, held.squeeze, held.job, _objections(held)
+        commanded = np.asarray(forces.max(axis=0)) if job is None else job.peak_normal_force
+        allowed, remedies = cell.workcell.task.reference_force, tuple[Remedy, ...]()
+        required = np.maximum(commanded, required_forces(cell.workcell, carry))
+        largest = carry.normal_force[:, 1 - LEADER], forces[:, 1 - LEADER]
+        most = box_motion(carry).at(np.union1d(*[np.argsort(-each)[:MOST] for each in largest]))
+        needs = (robust_model(cell.workcell), most, required, allowed)
+        if not is_within(required, allowed):
+            remedies = cheapest_remedies(*needs)
+        advance(1)
+        beside = []
+        for label, path in named.items():
+            beside.append(time_alternative(cell, label, path, timing, squeeze.force))
+            advance(1)
+        better = tuple(_better(beside, timing, squeeze.force))
+        if not alone and cell.workcell.handling.partner_stop is not None:
+            free = cell.changed({"handling.partner_stop": quantities.SEPARATION.high})
+            label = "the same path without partner_stop"
+            beside.append(time_alternative(free, label, carry.x[:-1], timing, squeeze.force))
+        margins = () if alone else commanded_margins(carry, forces)
+        advance(1)
+        hints = () if alone else advice(cell, paths, option, timing)
+        advance(1)
+        return Recommendation(
+            wish=wish,
+            member=int(rows[option.index]),
+            x=carry.x,
+            timing=timing,
+            force_kind=cell.force_kind,
+            limited_force=limits.limited_force(carry, timing.limits).max(axis=0),
+            commanded=commanded,
+            squeeze=squeeze,
+            job=job,
+            margins=margins,
+            rivals=tuple(beside),
+            advice=hints,
+            warnings=(*doubts, *better),
+            required=required,
+            budget=budget,
+            remedies=remedies,
+            reserve=Reserve(np.nan, np.nan) if alone else reserve(*needs),
+            why=why,
+        )
+
+
+def _require_members(cell: Cell, front: Front) -> None:
+    """Raise an error unless the cell is drivable and the front has members.
+
+    Args:
+        cell: cell of the recommendation.
+        front: its front.
+
+    Raises:
+        SettingsError: the cell is not drivable, or the front is empty.
+    """
     if not cell.workcell.task.law.is_drivable:
         raise SettingsError(
             f"the cell's time law is {cell.workcell.task.law.name!r}, which no robot drives; give "
@@ -213,78 +287,6 @@ def recommend(
             "evaluations or the task wider bounds",
             code="empty-front",
         )
-    named: dict[str, Array] = {} if alone else {HAND_MADE: cell.initial[:-1]} | dict(others or {})
-    with progress_bar(progress, "recommendation", STEPS + len(named)) as advance:
-        return _recommended(cell, front.x, wish, named, lambda: advance(1), alone)
-
-
-def _recommended(
-    cell: Cell,
-    given: Array,
-    wish: Wish,
-    named: Mapping[str, Array],
-    told: Callable[[], None],
-    alone: bool,
-) -> Recommendation:
-    rows = spread_rows(given[:, :-1])
-    paths = DrivenPaths(cell, given[rows, :-1])
-    options = paths.all_options(given[rows, -1], told)
-    goal, budget = Goal.of(wish, cell.workcell), cell.grip_budget
-    why = str(wish)
-    if not wish.has_target and not any((each.force <= goal.hardest).all() for each in options):
-        goal = replace(goal, hardest=np.full(2, np.inf))
-        why = f"{wish}, of carries that all exceed the reference force"
-    refuse(options, wish, goal, budget)
-    option, timing, is_kept = _driven(cell, paths, options, goal, wish.has_target)
-    if not is_kept:
-        why = "least excess over the reference force of the carries that were driven"
-    told()
-    carry, limits = timing.carry, cell.timing_model.carry_limits
-    assert carry is not None, "what is recommended has a timing"
-    held = command_forces(job_model(cell.timing_model), timing)
-    forces, squeeze, job, doubts = held.forces, held.squeeze, held.job, _objections(held)
-    commanded = np.asarray(forces.max(axis=0)) if job is None else job.peak_normal_force
-    allowed, remedies = cell.workcell.task.reference_force, tuple[Remedy, ...]()
-    required = np.maximum(commanded, required_forces(cell.workcell, carry))
-    largest = carry.normal_force[:, 1 - LEADER], forces[:, 1 - LEADER]
-    most = box_motion(carry).at(np.union1d(*[np.argsort(-each)[:MOST] for each in largest]))
-    needs = (robust_model(cell.workcell), most, required, allowed)
-    if not is_within(required, allowed):
-        remedies = cheapest_remedies(*needs)
-    told()
-    beside = []
-    for label, path in named.items():
-        beside.append(time_alternative(cell, label, path, timing, squeeze.force))
-        told()
-    better = tuple(_better(beside, timing, squeeze.force))
-    if not alone and cell.workcell.handling.partner_stop is not None:
-        free = cell.changed({"handling.partner_stop": quantities.SEPARATION.high})
-        label = "the same path without partner_stop"
-        beside.append(time_alternative(free, label, carry.x[:-1], timing, squeeze.force))
-    margins = () if alone else commanded_margins(carry, forces)
-    told()
-    hints = () if alone else advice(cell, paths, option, timing)
-    told()
-    return Recommendation(
-        wish=wish,
-        member=int(rows[option.index]),
-        x=carry.x,
-        timing=timing,
-        force_kind=cell.force_kind,
-        limited_force=limits.limited_force(carry, timing.limits).max(axis=0),
-        commanded=commanded,
-        squeeze=squeeze,
-        job=job,
-        margins=margins,
-        rivals=tuple(beside),
-        advice=hints,
-        warnings=(*doubts, *better),
-        required=required,
-        budget=budget,
-        remedies=remedies,
-        reserve=Reserve(np.nan, np.nan) if alone else reserve(*needs),
-        why=why,
-    )
 
 
 def _driven(
