@@ -437,7 +437,7 @@ def contact_function(
     numbers, cache = _held_numbers(workcell), Cache()
     key = key_of(
         name,
-        structure=numbers.digest,
+        structure=numbers.workcell_digest,
         expressions=_expressions(cache.folder),
         libraries=[f"scipy {library_version('scipy')}"],
     )

@@ -359,7 +359,7 @@ class _Fastest:
             raise SettingsError(f"there is no timing: {timing.reason}")
         self.carry, self._limits = timing.carry, timing.limits
         self._compiled = CompiledCell(self.carry.workcell)
-        self._digest = WorkcellParameters(self.carry.workcell).digest
+        self._digest = WorkcellParameters(self.carry.workcell).workcell_digest
         self._near = TimingSensitivity(TimingModel(self._compiled), timing)
 
     def moved_by(self, number: _Number) -> bool:
@@ -379,7 +379,7 @@ class _Fastest:
         """
         if number.is_limit or not self.moved_by(number):
             return False
-        return WorkcellParameters(workcell).digest != self._digest
+        return WorkcellParameters(workcell).workcell_digest != self._digest
 
     def durations(self, number: _Number, low: Workcell, high: Workcell) -> tuple[float, float]:
         """Compute the changes of the duration [s] from the present cell to two neighbouring cells.

@@ -208,14 +208,10 @@ class WorkcellParameters:
     def _vectors(self) -> dict[str, Array]:
         return {}
 
-    @property
-    def digest(self) -> str:
-        """Digest (SHA-256) of the topology without arms and collision bodies."""
-        return self._without_arms
-
     @cached_property
-    def _without_arms(self) -> str:
-        return digest_of_parts((self.workcell,))
+    def workcell_digest(self) -> str:
+        """Digest (SHA-256) of the topology without arms and collision bodies."""
+        return digest_of_parts((self._collected[1],))
 
     def symbols(self) -> NumberedWorkcell:
         """Return the cell's description with CasADi symbols in the place of all parameters."""
@@ -259,7 +255,7 @@ class CellParameters(WorkcellParameters):
             (model.model.saveToString(), model.flange_id, model.redundant, model.pose_size)
             for model in self.models
         )
-        return digest_of_parts((self._without_arms, arms))
+        return digest_of_parts((self.workcell_digest, arms))
 
     @cached_property
     def bodies_digest(self) -> str:
@@ -293,8 +289,8 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
 
     Values that no formula uses become constants.
     """
-    pairs = zip(cell.robots, cell.contacts, strict=True)
-    first, second = (_robot(take, i, *pair) for i, pair in enumerate(pairs))
+    first = _robot(take, 0, cell.robots[0], cell.contacts[0])
+    second = _robot(take, 1, cell.robots[1], cell.contacts[1])
     payload: Any = replace(cell.payload, size=np.zeros(3), shape=None, jerk_max=None)
     task: Any = replace(
         cell.task,
