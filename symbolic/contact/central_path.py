@@ -90,8 +90,9 @@ class ConvexProgram(Protocol):
         load and the free components determine the others."""
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
-        """Compute the scaled wrench of each contact from the column `free` of free components, in
-        balance with the load in the inputs `cell`. The result is affine in `free`."""
+        """Compute the scaled wrench of each contact such that all contacts together balance the
+        load, the first of the inputs `cell`. The result is affine in the column `free` of the
+        components that the load does not determine."""
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
         """Compute the cost of the scaled wrenches of all contacts: a scalar, the sum over the
@@ -99,8 +100,8 @@ class ConvexProgram(Protocol):
 
     def start(self, cell: list[ca.SX]) -> tuple[list[ca.SX], ca.SX]:
         """Return the start of the method for the inputs `cell`: the state (n,) of each patch,
-        within its cone and in balance with the load; and a scalar: weight of the barriers times the
-        sum of the patches' degrees, over the effort."""
+        within its cone and in balance with the load; and a scalar: barrier weight times the sum of
+        the patches' degrees, over the effort."""
 
     def __hash__(self) -> int:
         """Hash by identity: compiled functions are cached by program."""
@@ -142,8 +143,9 @@ class Patch(ABC):
 
     @abstractmethod
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
-        """Compute a number -1 / t < 0 with which `state` + t `change`, both (n,), still lies within
-        the cone. It bounds the relative changes of the eigenvalues of X from below."""
+        """Compute -1 / t, where t > 0 is a step length with which `state` + t `change`, both (n,),
+        is still within the cone. It bounds the relative changes of the eigenvalues of X from below.
+        """
 
     @abstractmethod
     def slack(self, state: ca.SX) -> ca.SX:
@@ -265,8 +267,8 @@ def centred(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Fu
 def _repeated(
     program: ConvexProgram, step: ca.Function, most: int, iterate: ca.MX, cell: list[ca.MX]
 ) -> ca.MX:
-    """Build the expression of an iterate after repeated steps: the function `step` is applied to
-    `iterate` in blocks of `BLOCK`, at most `most` times, until its flag is 0. `cell` has the inputs
+    """Build the expression of the iterate after at most `most` steps from `iterate`, in blocks of
+    `BLOCK`. The function `step` also returns a flag, and 0 ends the steps. `cell` has the inputs
     and symbolic parameters of the program."""
     held = [ca.MX.sym("iterate", iterate.shape[0]), ca.MX.sym("goes_on")]
     inputs = [*held, *_mx_inputs(program)]
@@ -287,9 +289,9 @@ def _repeated(
 def _step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     """Build the function of one step of the interior-point method.
 
-    Its inputs are an iterate, an unused flag and the program's inputs. Its outputs are the next
-    iterate, and a flag that is 1 if a further step is needed. The method ends at the weight
-    `final_weight` over the effort.
+    Inputs: an iterate, an unused flag, the program's inputs and symbolic parameters. Outputs: the
+    next iterate, and a flag that is 1 if a further step is needed. The barrier's weight falls to
+    `final_weight` times the effort.
     """
     iterate, cell = ca.SX.sym("iterate", ends_of(program)[-1]), _sx_inputs(program)
     owns = zip(program.patches, ca.vertsplit(iterate, ends_of(program)), strict=True)
@@ -324,12 +326,12 @@ def _step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Func
 
 @lru_cache(PROGRAMS)
 def barrier_step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
-    """Build the function of one Newton step of all patches' states towards the central path.
+    """Build the function of one Newton step of all patches' states towards the central path, at the
+    barrier weight `final_weight` times the effort.
 
-    Its inputs are the states, an unused flag, and the program's inputs and symbolic parameters. Its
-    outputs are the new states, and a flag that is 1 if a further step is needed. On the central
-    path, the derivatives by the inputs are those of the path. The weight is `final_weight` times
-    the effort.
+    Inputs: the states, an unused flag, the program's inputs and symbolic parameters. Outputs: the
+    new states, and a flag that is 1 if a further step is needed. At states on the central path, the
+    derivatives of the new states by the inputs are those of the central path.
     """
     states, cell = ca.SX.sym("states", state_ends(program)[-1]), _sx_inputs(program)
     owns = ca.vertsplit(states, state_ends(program))
@@ -346,11 +348,12 @@ def barrier_step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> 
 def barrier_equations(
     program: ConvexProgram, states: list[ca.SX], cell: list[ca.SX], final_weight: float
 ) -> tuple[ca.SX, list[ca.SX], Equations]:
-    """Build Newton's equations of the effort plus the barriers, at the state (n,) of each patch.
+    """Build Newton's equations for the minimum of effort plus barriers, at the state (n,) of each
+    patch. `cell` has the program's inputs.
 
     Returns:
-        The weight, `final_weight` times the effort; for each patch the multipliers (n,), -weight
-        times the barrier's gradient; and Newton's equations.
+        The barriers' weight, `final_weight` times the effort; the multipliers (n,) of each patch,
+        -weight times the gradient of its barrier; and Newton's equations.
     """
     weight = final_weight * program.effort(wrenches_of(program, states), cell)
     patches = zip(program.patches, states, strict=True)
@@ -387,8 +390,9 @@ def central_point(
 
 
 def _length(lowest: list[ca.SX], share: ca.SX | float) -> ca.SX:
-    """Compute the length of a Newton step, at most 1, that goes at most `share` of the way to any
-    cone's boundary. `lowest` is -1 / t of each patch, with t the length to its boundary."""
+    """Compute the length, at most 1, of a Newton step. It is at most `share` times t of any patch.
+    t is the step length at which a state reaches its cone's boundary; `lowest` has -1 / t of each
+    patch."""
     return ca.fmin(1.0, share / ca.fmax(-minimum(lowest), share))
 
 
@@ -512,21 +516,21 @@ class Equations:
         )
 
     def decrement(self, pulls: list[ca.SX], changes: list[ca.SX]) -> ca.SX:
-        """Compute the squared Newton decrement times the weight of the barriers, from the
+        """Compute the squared Newton decrement times the weight of the barriers, a scalar, from the
         multipliers `pulls` (m,) and the change `changes` (m,) of the state of each patch."""
         return ca.dot(ca.vertcat(*pulls) - self.slope, ca.vertcat(*changes))
 
     def changes(self, pulls: list[ca.SX]) -> list[ca.SX]:
-        """Compute the change (m,) of each patch's state in a Newton step from the patches'
-        multipliers `pulls`, (m,) each. The new states balance the load."""
+        """Compute the change (m,) of each patch's state in a Newton step, after which the states
+        balance the load. `pulls` has the multipliers (m,) of each patch."""
         pull = ca.vertcat(*pulls) - self.slope - ca.mtimes(self._stiff, self.missing)
         found: list[ca.SX] = ca.vertsplit(self.missing + self.balanced_change(pull), self._ends)
         return found
 
     def constrained(self, moved: ca.SX) -> ca.SX:
-        """Compute the changes (n, k) of all states that follow from changes `moved` (n, k) of the
-        dependent components. The free components follow so that effort plus barriers stay
-        minimal."""
+        """Compute the changes (n, k) of all states that follow from `moved` (n, k): k changes of
+        the components that the load determines, zero for other components. Those follow such that
+        effort plus barriers stay minimal."""
         pulls = ca.horzsplit(-ca.mtimes(self._stiff, moved))
         return moved + ca.horzcat(*map(self.balanced_change, pulls))
 
@@ -549,8 +553,8 @@ class Equations:
 def effort_derivatives(
     program: ConvexProgram, states: list[ca.SX], cell: list[ca.SX]
 ) -> list[ca.SX]:
-    """Compute effort (scalar), gradient (n,) and Hessian (n, n) by the n entries of all states.
-    `states` has the state of each patch, `cell` the program's inputs."""
+    """Compute the effort (scalar), and its gradient (n,) and Hessian (n, n) by the n entries of all
+    states. `states` has the state of each patch, `cell` the program's inputs."""
     symbols = [ca.SX.sym("state", state.shape[0]) for state in states]
     effort, whole = program.effort(wrenches_of(program, symbols), cell), ca.vertcat(*symbols)
     by = [effort, *ca.hessian(effort, whole)[::-1]]
@@ -580,10 +584,12 @@ def degree_of(program: ConvexProgram) -> float:
 
 
 def ends_of(program: ConvexProgram) -> list[int]:
-    """Return the index at which each patch begins in the column of all iterates, then its size."""
+    """Return the index at which each patch's iterate begins in the column of all iterates, and last
+    the size of the column."""
     return [0, *accumulate(patch.iterate_size for patch in program.patches)]
 
 
 def state_ends(program: ConvexProgram) -> list[int]:
-    """Return where each patch of the program begins in the column of all states, then its size."""
+    """Return the index at which each patch's state begins in the column of all states, and last the
+    size of the column."""
     return [0, *accumulate(patch.state_size for patch in program.patches)]

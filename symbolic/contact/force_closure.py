@@ -161,10 +161,9 @@ def balance_maps(workcell: Workcell, in_units: bool = False) -> list[Array]:
 
 def _balanced_states(workcell: Workcell, share: float) -> tuple[Array, ...] | None:
     """Find one scaled state (4,) per pad such that the wrenches of all pads sum to zero; None if
-    impossible.
+    there are no such states.
 
-    Each state lies within the pad's cone for `share` times the friction. It is a sum, with positive
-    weights, of points on the cone's boundary.
+    Each state lies within the pad's friction cone for `share` times the friction coefficient.
     """
     maps = balance_maps(workcell)
     lessened = [_with_friction(_generators(pad), share) for pad in workcell.pads]
@@ -181,11 +180,14 @@ def _balanced_states(workcell: Workcell, share: float) -> tuple[Array, ...] | No
 
 
 def _weights(columns: Array) -> Array | None:
-    """Find positive weights (n,) with sum one for which the weighted sum of the rows a_j of
-    `columns` (n, m) is zero; None if there are none.
+    """Find n positive weights with sum one, such that the weighted sum of n vectors is zero; None
+    if there are none.
 
-    Such weights exist exactly if the polytope 1 + a_j . y > 0 has an analytic centre. At the centre
-    they are proportional to 1 / (1 + a_j . y).
+    Such weights exist exactly if the polytope of all y with 1 + a_j . y > 0, for every vector a_j,
+    has an analytic centre. At the centre they are proportional to 1 / (1 + a_j . y).
+
+    Args:
+        columns: (n, m) the vectors a_j as rows.
     """
     if np.linalg.matrix_rank(columns) < columns.shape[1]:
         return None
@@ -257,7 +259,7 @@ def _generators(contact: Contact) -> Array:
 
 def dependent_components(workcell: Workcell) -> tuple[int, ...]:
     """Select the components of all pads' states that follow from the load and from the other
-    components, as indices into the states one after the other.
+    components. Return their indices in the array of all states, one pad after the other.
 
     The choice takes forces before moments, in the order of the pads, until the selected components
     can balance every load. It depends on neither friction nor sizes, and small displacements of the
@@ -274,10 +276,13 @@ def dependent_components(workcell: Workcell) -> tuple[int, ...]:
 
 
 def _new_columns(matrix: Array, order: Sequence[int], least: float) -> list[int]:
-    """Select the indices of linearly independent columns of a matrix, in the order `order`.
+    """Select linearly independent columns of a matrix, and return their indices in the order of
+    selection.
 
-    A column is selected if its part outside the span of the selected columns is longer than
-    `least`.
+    Args:
+        matrix: the matrix.
+        order: indices of its columns in the order of trial.
+        least: a column is selected if its part outside the span of those selected before is longer.
     """
     taken: list[int] = []
     span = np.zeros((len(matrix), 0))
@@ -296,8 +301,8 @@ def derive_grasp_numbers(workcell: Workcell, reach: float = 1.0) -> GraspNumbers
 
     Args:
         workcell: cell with the pads.
-        reach: the internal squeeze is chosen for patches smaller by this factor, so that its
-            pressure stays away from the rims.
+        reach: factor, at most 1, on the sizes of the patches for which the internal squeeze is
+            chosen. A smaller factor keeps its pressure away from the rims.
 
     Raises:
         SettingsError: no internal squeeze exists.
@@ -350,8 +355,9 @@ def grasp_shapes(workcell: Workcell) -> dict[str, Any]:
 
 
 def _shape(pad: Contact) -> Array:
-    """Return three lengths (3,) of a rectangular patch over its radius, mean distance of its points
-    from the centre and both diagonal entries of `SoftPatch.spread`; an empty array for a disc."""
+    """Return the shape of a pad's patch as three lengths (3,), each over the patch radius: the mean
+    distance of the points from the centre, and the diagonal entries of `SoftPatch.spread`. The
+    array is empty for a disc."""
     if pad.half_sides is None:
         return np.zeros(0)
     patch = scaled_patch(pad)
@@ -368,8 +374,8 @@ def least_distance(workcell: Workcell) -> float:
 
 
 def smaller_patches(workcell: Workcell, share: float) -> Workcell:
-    """Return the workcell with the size of every contact patch multiplied by `share`, at unchanged
-    places."""
+    """Return the workcell with the size of every contact patch multiplied by `share`. The pads keep
+    their poses."""
 
     def smaller(contact: Contact) -> Contact:
         sides = contact.half_sides

@@ -113,26 +113,30 @@ class Grasp:
         return len(self._free)
 
     def free(self, wrenches: list[ca.SX]) -> ca.SX:
-        """Select the free components (free_size,) from the scaled wrenches (4,) of all pads."""
+        """Select those components (free_size,) of all pads' scaled wrenches (4,) that the load does
+        not determine."""
         return ca.vertcat(*wrenches)[self._free.tolist()]
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
-        """Compute the scaled wrenches (4,) of all pads that balance the load.
+        """Compute the scaled wrench (4,) of each pad such that all pads together balance the load.
 
         Args:
-            free: (free_size,) free components of the wrenches.
-            cell: inputs of the program, first the load.
+            free: (free_size,) components of the scaled wrenches that the load does not determine.
+            cell: inputs of the convex program in this order: load (6,) about the box frame's
+                origin, along the box's axes; friction (2,) of each robot's pads; in some programs
+                relative patch sizes (2,).
         """
         load, *sizes = cell
         return self._balanced_wrenches(load, free, sizes)
 
     def _balanced_wrenches(self, load: ca.SX, free: ca.SX, sizes: list[ca.SX]) -> list[ca.SX]:
-        """Compute the scaled wrenches (4,) of all pads that balance a load.
+        """Compute the scaled wrench (4,) of each pad such that all pads together balance a load.
 
         Args:
-            load: (6,) load.
-            free: (free_size,) free components of the wrenches.
-            sizes: friction (2,), and relative patch sizes (2,) if the program has this input.
+            load: (6,) force and moment about the box frame's origin, along the box's axes.
+            free: (free_size,) components of the scaled wrenches that the load does not determine.
+            sizes: friction (2,), and relative patch sizes (2,) if the convex program has this
+                input.
         """
         units = ca.vertcat(*[self.units(i, *sizes) for i in range(len(self.patches))])
         given = ca.mtimes(number(self.numbers.free_to_left), units[self._free.tolist()] * free)
@@ -191,7 +195,8 @@ class Grasp:
         return [c + press * s for c, s in zip(chosen, given, strict=True)], share
 
     def _squeeze_scale(self, given: list[ca.SX], asked: list[ca.SX]) -> ca.SX:
-        """Compute a factor on the internal squeeze with which all states lie within the cones.
+        """Compute a factor on the internal squeeze. States plus this multiple of the squeeze lie
+        within the friction cones.
 
         Args:
             given: state (4,) of each pad in the internal squeeze.
@@ -202,10 +207,10 @@ class Grasp:
 
     @cached_property
     def _at_rest(self) -> tuple[ca.SX, ca.SX]:
-        """States of all pads with the payload at rest, and their derivatives by the load.
+        """States (n,) of all pads with the payload at rest, one after the other, and their
+        derivatives (n, 6) by the load.
 
-        The scaled wrenches (n,) stand one after the other; the derivatives are (n, 6). These states
-        balance the load at rest and lie on the program's central path.
+        The states balance the load at rest and lie on the convex program's central path.
         """
         numbers = self.numbers if self.numbers.rest is not None else self.complete()
         return ca.SX(number(numbers.rest)), ca.SX(number(numbers.rest_slopes))
@@ -223,7 +228,8 @@ class Grasp:
         return replace(self.numbers, rest=rest, rest_slopes=slopes)
 
     def _nominal(self) -> tuple[list[float], ...]:
-        """Return the workcell's values of the program's inputs, without the load: friction (2,)."""
+        """Return the workcell's own values of all inputs of the convex program except the load:
+        friction (2,)."""
         return (np.array(ca.evalf(self.friction)).ravel().tolist(),)
 
     def least_states(self, load: ca.SX, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
@@ -308,12 +314,13 @@ class Grasp:
     def result(
         self, wrenches: list[ca.SX], sizes: list[ca.SX]
     ) -> tuple[ca.SX, ca.SX | ca.DM | float]:
-        """Convert scaled wrenches to the result of the program, divided by the size of the load.
+        """Convert scaled wrenches to wrenches. The load has been divided by its size, so these are
+        wrenches over the size of the load.
 
         Args:
             wrenches: scaled wrench (4,) of each pad.
             sizes: inputs named in `SCALING_INPUTS`: friction coefficients (2,), and relative patch
-                sizes (2,) if the program has this input.
+                sizes (2,) if the convex program has this input.
 
         Returns:
             Wrenches (6 k,) of all k pads; and the values (6 k,) that replace them if friction does
@@ -338,11 +345,12 @@ class Grasp:
         return ca.vertcat(1.0, mu, mu, mu * (reach[robot] * radius))
 
     def _at(self, states: ca.SX, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
-        """Rescale the states (n,) of all pads, one after the other, from the nominal friction and
-        patch sizes to others, for unchanged forces.
+        """Convert states of all pads to the scales of another friction and other patch sizes. The
+        forces stay the same.
 
         Args:
-            states: (n,) states scaled by the nominal friction and patch sizes.
+            states: (n,) states of all pads, one after the other, scaled by the nominal friction and
+                patch sizes.
             friction: (2,) friction coefficients of the robots' pads.
             reach: (2,) sizes of the robots' patches over the cell's own sizes.
 

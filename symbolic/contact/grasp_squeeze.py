@@ -65,17 +65,27 @@ class GraspSqueeze(Grasp):
         self.cell_sizes = (*self.cell_sizes, ("reach", 2), ("displacement", 4))
 
     def _nominal(self) -> tuple[list[float], ...]:
-        """Return the values of the inputs after the load in the workcell: friction (2,), relative
-        patch sizes (2,) of 1, displacements (4,) of 0."""
+        """Return the workcell's own values of all inputs of the convex program except the load.
+
+        Returns:
+            Friction (2,), relative patch sizes (2,), which are 1, and displacements (4,), which are
+            0.
+        """
         return (*super()._nominal(), [1.0, 1.0], [0.0] * 4)
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
-        """Compute the scaled wrenches (4,) of all pads that balance the load at the displaced
-        places.
+        """Compute the scaled wrench (4,) of each pad such that all pads together balance the load,
+        with every pad displaced along its tangents.
+
+        The displacement changes the moments of the forces. `DISPLACED` fixed-point iterations find
+        forces that balance these moments too.
 
         Args:
-            free: free components of the wrenches.
-            cell: inputs of the program, with load and displacement of the pads.
+            free: (free_size,) components of the scaled wrenches that the load does not determine.
+            cell: inputs of the convex program in this order: load (6,) about the box frame's
+                origin, along the box's axes; friction (2,) of each robot's pads; size (2,) of each
+                robot's patches over the cell's own size; displacement (4,) of the pads [m], two
+                tangential components per robot.
         """
         load, friction, reach, displacement = cell
         wrenches = self._balanced_wrenches(load, free, [friction, reach])
@@ -87,12 +97,12 @@ class GraspSqueeze(Grasp):
         return wrenches
 
     def _turned(self, wrenches: list[ca.SX], displacement: ca.SX, sizes: list[ca.SX]) -> ca.SX:
-        """Compute the moment (3,) that the pads' forces gain because the pads are displaced, box
-        axes.
+        """Compute the moment (3,) that the pads' forces gain because the pads are displaced, along
+        the box's axes.
 
         Args:
             wrenches: scaled wrench (4,) of each pad.
-            displacement: (4,) displacement of each robot's pads in the pad plane [m].
+            displacement: (4,) displacement of the pads [m], two tangential components per robot.
             sizes: inputs that scale the wrenches: friction (2,), relative patch sizes (2,).
         """
         total = ca.SX.zeros(3)
@@ -104,12 +114,12 @@ class GraspSqueeze(Grasp):
         return total
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
-        """Compute the normal force of the commanded robot plus `OTHER_WEIGHT` times the other
-        robot's.
+        """Compute the cost that the convex program minimises: the normal force of the commanded
+        robot plus `OTHER_WEIGHT` times the normal force of the other robot.
 
         Args:
             wrenches: scaled wrench (4,) of each pad.
-            cell: inputs of the program, which the effort does not need.
+            cell: inputs of the convex program, which the cost does not need.
         """
         total = 0.0
         for wrench, robot in zip(wrenches, self.robots, strict=True):
@@ -117,14 +127,16 @@ class GraspSqueeze(Grasp):
         return total
 
     def result(self, wrenches: list[ca.SX], sizes: list[ca.SX]) -> tuple[ca.SX, ca.SX | float]:
-        """Convert scaled wrenches to normal forces, divided by the size of the load.
+        """Convert scaled wrenches to the normal forces of the robots. The load has been divided by
+        its size, so these are forces over the size of the load.
 
         Args:
             wrenches: scaled wrench (4,) of each pad.
             sizes: friction coefficients (2,) and relative patch sizes (2,); not used.
 
         Returns:
-            Normal force (2,) of each robot, and the value that replaces it if there is no solution.
+            Normal force (2,) of each robot, and the number that replaces it if there is no
+            solution.
         """
         force = [ca.SX(0.0), ca.SX(0.0)]
         for own, robot in zip(wrenches, self.robots, strict=True):
@@ -199,12 +211,12 @@ def commanded_slack(
 
 
 def internal_force_gain(squeeze: GraspSqueeze) -> ca.Function:
-    """Build the function of the additional commanded force, in newtons per newton of tangential
-    force with which the arms push against each other at any pad.
+    """Build the function of the additional commanded force that the arms need if they push against
+    each other along the faces, per newton of this push at any pad.
 
-    The friction that the internal squeeze leaves bears this push. Inputs: friction coefficients
-    (2,) and relative patch sizes (2,) of the robots, then the symbolic parameters. Output: a
-    scalar.
+    The additional squeeze raises the friction, which bears the push. Inputs: friction coefficients
+    (2,) and relative patch sizes (2,) of the robots, then the symbolic parameters. Output: a scalar
+    [N/N].
     """
     friction, share = ca.SX.sym("friction", 2), ca.SX.sym("share", 2)
     given = squeeze.squeeze_states(friction, share / squeeze.numbers.reach)

@@ -121,13 +121,17 @@ class SoftFingers:
 def torsion_capacity(
     grip: Expression, tangent: Expression, patch: SoftPatch
 ) -> tuple[Expression, Expression]:
-    """Compute the largest torsion that a pad can bear [N m] by formula (1) of the module, and its
-    derivative by the grip [m].
+    """Compute the largest torsion that a pad can bear beside a tangential force.
 
     Args:
-        grip: sqrt(mu^2 N^2 - T . T), the friction that the tangential force T leaves [N].
+        grip: friction that the tangential force T leaves, sqrt(mu^2 N^2 - T . T), with friction
+            coefficient mu and normal force N [N].
         tangent: (2,) tangential force T [N].
         patch: patch of the pad.
+
+    Returns:
+        The torsion [N m], from formula (1) of the module's docstring, and its derivative by the
+        grip [m].
     """
     return _capacity(grip, _squared(tangent), patch.twist, _half_spread(patch, tangent))
 
@@ -135,13 +139,17 @@ def torsion_capacity(
 def _capacity(
     grip: Expression, squared: Expression, twist: Expression, half: Expression
 ) -> tuple[Expression, Expression]:
-    """Compute the largest torsion [N m] as in `torsion_capacity`, and its derivative by the grip
-    [m].
+    """Compute the largest torsion that a pad can bear beside a tangential force.
 
     Args:
-        grip: friction that the tangential force leaves [N].
-        squared: squared tangential force [N^2].
-        twist, half: lengths c and h / 2 of (1) [m].
+        grip: friction that the tangential force T leaves, sqrt(mu^2 N^2 - T . T), with friction
+            coefficient mu and normal force N [N].
+        squared: squared tangential force T . T [N^2].
+        twist: mean distance of the patch's points from its centre [m].
+        half: root mean square of the coordinates of the patch's points along T [m].
+
+    Returns:
+        The torsion [N m], and its derivative by the grip [m].
     """
     s = grip**2 / (grip**2 + squared)
     bend = BEND * twist
@@ -157,7 +165,8 @@ def _squared(tangent: Expression) -> Expression:
 
 
 def _half_spread(patch: SoftPatch, tangent: Expression) -> Expression:
-    """Compute the length h / 2 in formula (1) of the module [m] for a tangential force.
+    """Compute the root mean square of the coordinates of a patch's points along a tangential force
+    [m].
 
     Args:
         patch: shape of the contact patch.
@@ -195,8 +204,13 @@ def least_soft_squeeze(
     rest = moment - ca.cross((arms[0] + arms[1]) / 2.0, force)
 
     def shared(squeeze: Expression) -> Load:
-        """Compute the tangential force (2,) of each contact [N] and the common torsion [N m], if
-        the sum of the normal forces is `squeeze` [N]."""
+        """Compute how two contacts share the load if the sum of their normal forces is `squeeze`
+        [N].
+
+        Returns:
+            Tangential force (2,) of each contact [N], and the torsion that both bear together [N
+            m].
+        """
         half = ca.vertcat(
             (rest[1] + apart[0] * squeeze / 2.0) / apart[2],
             (apart[1] * squeeze / 2.0 - rest[0]) / apart[2],
@@ -231,16 +245,19 @@ def _pressed(
     patches: tuple[SoftPatch, SoftPatch],
     implicit: ImplicitVariables | None,
 ) -> tuple[Expression, Expression]:
-    """Compute the least normal forces (2,) [N] for given tangential forces and torsion, and the
-    torsion capacities (2,) [N m] at these forces.
+    """Compute the least normal forces of two pads that bear given tangential forces and a torsion.
 
     Args:
         load: tangential force (2,) of each contact [N], and the torsion that both bear together [N
             m].
-        difference: N_1 - N_2 [N].
+        difference: normal force of contact 1 minus normal force of contact 2 [N].
         friction: (2,) Coulomb coefficients.
         patches: patches of both pads.
         implicit: collector of results of Newton's method, for exact derivatives; None for none.
+
+    Returns:
+        Normal forces (2,) [N]; and the largest torsion (2,) that each pad can bear beside its
+        tangential force at these forces [N m].
     """
     *tangents, torsion = load
     asked, squares = ca.fabs(torsion), [_squared(tangent) for tangent in tangents]
@@ -259,8 +276,12 @@ def _pressed(
     share, ahead = mu[1] / mu[0], mu[0] * beyond
 
     def other_grip_squared(bound: Expression) -> Expression:
-        """Compute the squared grip of the pad that slips second [N^2] from `bound`, mu N of the pad
-        that slips first [N]."""
+        """Compute the squared grip of the pad that slips second [N^2]. A pad's grip is the friction
+        that its tangential force leaves.
+
+        Args:
+            bound: friction coefficient times normal force of the pad that slips first [N].
+        """
         return ca.fmax((share * (bound + ahead)) ** 2 - squared[1], 0.0) + FORCE_FLOOR**2
 
     def newton(grip: Expression) -> Expression:
@@ -296,17 +317,19 @@ def _first_grip(
     squared: Both,
     ahead: Expression,
 ) -> Expression:
-    """Estimate the grip of the pad that slips first: the friction that its tangential force leaves
-    [N].
+    """Estimate the grip of the pad that slips first [N]. A pad's grip is the friction that its
+    tangential force leaves.
 
-    The torsion of each pad is taken as grip times a lever that is linear in s of formula (1) of the
-    module. In all pairs of arguments the pad that slips first comes first.
+    The torsion of a pad is approximated as its grip g times h / 2 + s (c - h / 2), where s is g^2 /
+    (g^2 + squared tangential force), c is the mean distance of the patch's points from its centre,
+    and h / 2 the root mean square of their coordinates along the tangential force. Of each pair of
+    arguments, the first belongs to the pad that slips first.
 
     Args:
         asked: absolute torsion that both pads bear together [N m].
-        levers: lengths c of the two pads, and lengths h / 2 of the two pads [m].
+        levers: pair of lengths c, and pair of lengths h / 2 [m].
         share: friction coefficient of the other pad over the coefficient of the first.
-        squared: squared tangential forces of the two pads [N^2].
+        squared: pair of squared tangential forces [N^2].
         ahead: squared grip of the other pad when the first begins to slide without torsion [N^2].
     """
     twist, half = levers

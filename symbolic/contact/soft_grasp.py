@@ -105,10 +105,10 @@ class SoftGrasp:
         return ca.Function("held_wrenches", [state, *self.grasp.given.values()], results)
 
     def second(self) -> ca.Function:
-        """Build the function of the normal forces' second derivatives by the load.
+        """Build the function of the second derivatives of the robots' normal forces by the load.
 
-        Inputs: state (size,) of all patches; weight (2,) of each robot's normal force. Output:
-        curvature (6, 6), the Hessian of the weighted sum of the normal forces.
+        Inputs: state (size,) of all patches; weight (2,), a factor on each robot's normal force.
+        Output: curvature (6, 6), the Hessian of the weighted sum of the normal forces.
         """
         state, weight = ca.SX.sym("state", self.size), ca.SX.sym("weight", ROBOTS)
         local = _Local(self, state)
@@ -132,8 +132,8 @@ class SoftGrasp:
         return ca.Function("slopes", inputs, ca.cse([ca.densify(value) for value in outputs]))
 
     def _newton(self) -> ca.Function:
-        """Build the function of one Newton step of the states (size,) of all patches, at an
-        unchanged load."""
+        """Build the function of one Newton step: from the states (size,) of all patches to better
+        states for an unchanged load."""
         state = ca.SX.sym("state", self.size)
         local = _Local(self, state)
         inputs = [state, *self.grasp.given.values()]
@@ -167,10 +167,11 @@ class _Local:
         self._share = 1.0 / (1.0 - ca.dot(self._g, self._answer))
 
     def solve(self, pull: ca.SX) -> ca.SX:
-        """Compute the change Y y (n,) of the states, where y solves Y' F Y y = Y' pull.
+        """Compute the change Y y (n,) of the states in a Newton step, from Y' F Y y = Y' pull.
 
-        F is the Hessian of f by the states, Y the derivative of the states by their free
-        components.
+        F is the Hessian (n, n) of the objective f (log effort plus weighted barriers) by the
+        states. Y (n, free_size) is the derivative of the states by their free components, and y the
+        change of these components.
 
         Args:
             pull: (n,) right side, one entry per entry of the states.
@@ -178,22 +179,24 @@ class _Local:
         return self._with_g(self._effort * self._equations.balanced_change(pull))
 
     def by_load(self) -> ca.SX:
-        """Compute the derivatives U (n, 6) of the states by the load."""
+        """Compute the derivatives (n, 6) of the states by the load."""
         return self._with_g(self._equations.constrained(self._loaded))
 
     def _with_g(self, found: ca.SX) -> ca.SX:
-        """Return the solutions (n, k) of Newton's equations with the part -g g' of the curvature.
-
-        g (n,) is the gradient of log effort. The Sherman-Morrison formula corrects the solutions
-        without this part.
+        """Correct solutions of Newton's equations for the rank-one part -g g' of the curvature, by
+        the Sherman-Morrison formula. g (n,) is the gradient of log effort.
 
         Args:
-            found: (n, k) solutions without this part.
+            found: (n, k) solutions without the rank-one part.
+
+        Returns:
+            (n, k) solutions with this part.
         """
         return found + ca.mtimes(self._answer, self._share * ca.mtimes(self._g.T, found))
 
     def third(self, along: ca.SX, by_load: ca.SX) -> ca.SX:
-        """Compute U' T[d] U (6, 6), where T is the third derivative of f by the states.
+        """Compute the matrix U' T[d] U (6, 6), where T[d] is the derivative along d of the Hessian
+        of the objective f (log effort plus weighted barriers) by the states.
 
         Args:
             along: (n,) direction d of the states.

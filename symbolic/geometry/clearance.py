@@ -60,16 +60,15 @@ def screening_functions(
 ) -> dict[str, ca.Function]:
     """Build the functions that collision checking calls, by name.
 
-    clearance: pose (6,), q_1 and q_2 (n,) of one sample [m, rad] -> lower bounds (n_near,) [m] of
-    the distances of the near possible pairs (`CellGeometry.near`), in order.
+    All take one sample: pose (6,) of the box, joint positions q_1 and q_2 (n,) [m, rad].
 
-    far_clearance: the same inputs -> bounds of the other possible pairs [m]; only if there are
-    any.
-
-    piece_poses: the same inputs -> quaternions (4, n_pieces) as w x y z, and positions (3,
-    n_pieces) [m], of every piece of every body in the world, in the order of the bodies.
-
-    motion, far_motion: the functions of `motion_function` for near and other pairs.
+    - clearance returns lower bounds (n_near,) [m] of the distances of the near possible pairs
+      (`CellGeometry.near`), in order.
+    - far_clearance returns lower bounds of the distances of the other possible pairs [m]. It exists
+      only if there are any.
+    - piece_poses returns the poses in the world of all pieces of all bodies, in the order of the
+      bodies: quaternions (4, n_pieces) as w x y z, and positions (3, n_pieces) [m].
+    - motion and far_motion are the functions of `motion_function` for near and other pairs.
 
     Args:
         geometry: bodies and pairs of the cell.
@@ -113,11 +112,14 @@ def screening_functions(
 
 
 def _piece_pose(placed: tuple[ca.SX, ca.SX] | None, turn: Any, centre: Any) -> tuple[ca.SX, ca.SX]:
-    """Compute the unit quaternion (4,) and the position (3,) [m] of a piece in the world.
+    """Compute the unit quaternion (4,), w x y z, and the position (3,) [m] of a piece in the world.
 
     Args:
-        placed: rotation (3, 3) and position (3,) of the piece's frame; None if the piece is fixed.
-        turn, centre: the piece's entry in `ScreenBody.pieces`.
+        placed: rotation (3, 3) and position (3,) [m] in the world of the frame in which the piece
+            is given; None for a piece of a fixed body, which is given in the world.
+        turn: rotation of the piece. With `placed` it is a matrix (3, 3) in that frame, or None for
+            the identity. Without `placed` it is a quaternion (4,), w x y z.
+        centre: (3,) centre of the piece in the same frame as `turn` [m].
     """
     position = ca.SX(number(centre))
     if placed is None:
@@ -239,10 +241,11 @@ class DistanceBounds:
         return list(zip(self._interval(i, axes), self._interval(j, axes), strict=True))
 
     def _gap(self, pairs: Sequence[tuple[Interval, Interval]]) -> ca.SX:
-        """Compute the largest gap [m] over several directions.
+        """Compute the largest gap [m] between two bodies over several directions.
 
         Args:
-            pairs: for each direction the intervals of both bodies along it [m].
+            pairs: for each direction the intervals (least, largest coordinate) of the first and of
+                the second body along it [m].
         """
         return self.soft.maximum_below(_gaps(pairs))
 
@@ -266,12 +269,12 @@ class DistanceBounds:
         return self._intervals[key]
 
     def _piece_interval(self, A: ca.SX, offset: ca.SX, piece: CoverSolid) -> list[Interval]:
-        """Compute the least and largest coordinate of a cover piece along three directions [m].
+        """Compute the least and largest coordinate of a piece along three directions [m].
 
         Args:
             A: (3, 3) the directions as rows, in the axes of the piece's frame.
             offset: (3,) coordinates of the frame's origin along the directions [m].
-            piece: the cover piece.
+            piece: a piece of a cover, a union of simple shapes that contains the body.
         """
         middle = ca.mtimes(A, ca.SX(number(piece.centre))) + offset
         seen = A if piece.rotation is None else ca.mtimes(A, turned(piece.rotation))
@@ -283,7 +286,7 @@ class DistanceBounds:
 
         Args:
             u: (1, 3) unit vector in the piece's own axes.
-            piece: the cover piece.
+            piece: a piece of a cover, a union of simple shapes that contains the body.
         """
         size = ca.SX(number(piece.size))
         if piece.kind is Box:
@@ -296,8 +299,13 @@ class DistanceBounds:
         return axial + size[0]
 
     def _seen(self, frame: Frame, axes: Axes) -> tuple[ca.SX, ca.SX]:
-        """Compute a frame's rotation (3, 3) and origin (3,) [m] in coordinates along the directions
-        `axes`."""
+        """Compute a frame's rotation (3, 3), and its origin (3,) [m] relative to the world's
+        origin, in coordinates along three directions.
+
+        Args:
+            frame: the frame.
+            axes: the directions.
+        """
         key = (frame, axes.key)
         if key not in self._relative:
             R, p = self._placed[frame]
@@ -324,7 +332,7 @@ class DistanceBounds:
         return self._chains[index], ca.SX(number(body.chain.radius))
 
     def _nearest(self, squared: Sequence[ca.SX]) -> ca.SX:
-        """Compute the root of the smallest of several squared distances."""
+        """Compute the smallest of several distances [m] from their squares [m^2]."""
         if self.soft.width:
             return self.soft.minimum_below([self.soft.norm_below(s) for s in squared])
         return self.soft.norm_below(self.soft.minimum_below(squared))
@@ -387,9 +395,9 @@ class DistanceBounds:
         [m].
 
         Args:
-            index: index of the moving body.
-            other: index of the obstacle's body.
-            k: index of the piece.
+            index: index of the moving body among all bodies.
+            other: index of the obstacle among all bodies.
+            k: index of the piece among the obstacle's pieces.
         """
         body, obstacle = self.screen.bodies[index], self.screen.bodies[other].obstacles[k]
         axes = self._world
@@ -429,12 +437,12 @@ class DistanceBounds:
 
 
 def _ends(extent: Any, k: int) -> list[Interval]:
-    """Return the interval of a body or piece along each of three directions: least, largest
-    coordinate.
+    """Return the intervals of a body or piece along three directions, each as (least, largest
+    coordinate) [m].
 
     Args:
-        extent: (2 m, 3) table of m bodies or pieces, two rows for each: least, then largest
-            coordinates along the directions [m].
+        extent: (2 m, 3) coordinates of m bodies or pieces [m]. Rows 2 k and 2 k + 1 hold the least
+            and largest coordinates of number k along the directions.
         k: index of the body or piece.
     """
     rows = ca.SX(number(extent))
@@ -442,7 +450,8 @@ def _ends(extent: Any, k: int) -> list[Interval]:
 
 
 def _gaps(pairs: Sequence[tuple[Interval, Interval]]) -> list[ca.SX]:
-    """Compute for each pair of intervals both gaps: the first above, and the first below."""
+    """Compute two gaps [m] for each pair of intervals: from the second interval up to the first,
+    and from the first up to the second. A gap is negative if the intervals overlap."""
     return [gap for a, b in pairs for gap in (a[0] - b[1], b[0] - a[1])]
 
 
@@ -471,13 +480,15 @@ def motion_function(
     pairs: Iterable[int],
 ) -> ca.Function:
     """Build the function that bounds the relative motion of pairs of bodies between two
-    configurations.
+    configurations a and b.
 
     Inputs: pose_a (6,), q_1_a, q_2_a (n,), then pose_b, q_1_b, q_2_b [m, rad]. Outputs: chord and
-    bend (n_pairs,) [m], each the sum over both bodies of a pair. The chord bounds the distance of a
-    point's places in the two configurations, the bend the second derivative of its path (D and K of
-    the module). For two links of one arm the chord instead bounds the length of the later link's
-    path as seen from the earlier link, and the bend is zero.
+    bend (n_pairs,) [m], each the sum of two bounds, one per body of the pair. A body's chord bounds
+    the distance between the positions of any of its points in a and b. A body's bend bounds the
+    second derivative of the point's path from a to b, for a path parameter that runs from 0 to 1.
+
+    Two links of one arm are an exception: chord bounds the length of the path that the later link's
+    points take as seen from the earlier link, and bend is zero.
 
     Args:
         geometry: bodies and pairs of the cell.
@@ -523,16 +534,18 @@ def _body_motion(
     placed_b: dict[Frame, tuple[ca.SX, ca.SX]],
     steps: list[ca.SX],
 ) -> tuple[ca.SX, ca.SX]:
-    """Compute bounds of a body's motion between two configurations a and b: chord and bend [m].
+    """Compute two bounds of a body's motion between two configurations a and b: chord and bend [m].
 
-    The chord bounds the distance of a point's places in a and b, the bend the second derivative of
-    its path.
+    The chord bounds the distance between the positions of any point of the body in a and b. The
+    bend bounds the second derivative of the point's path from a to b, for a path parameter that
+    runs from 0 to 1.
 
     Args:
         screen: numbers of the bodies.
         body: the body.
-        placed_a, placed_b: rotation (3, 3) and position (3,) [m] of every frame in the world.
-        steps: absolute changes of box pose (6,), q_1 and q_2 (n,).
+        placed_a, placed_b: rotation (3, 3) and position (3,) [m] of every frame in the world, in
+            configuration a and b.
+        steps: absolute changes from a to b of box pose (6,), q_1 and q_2 (n,).
     """
     if body.reach is None:
         return ca.SX(0), ca.SX(0)
