@@ -118,8 +118,8 @@ def candidate_function(model: CellModel) -> ca.Function:
 
 
 def _all(model: CellModel) -> dict[str, ca.MX]:
-    """Return one MX column per parameter group that the evaluation of a candidate needs, by
-    group."""
+    """Return one MX column for each parameter group that the evaluation of a candidate needs, by
+    the group's name."""
     workcell = model.workcell
     return mx_parameters(workcell.task, *workcell.robots, model, workcell.payload)
 
@@ -224,22 +224,20 @@ def force_sizes(workcell: Workcell) -> dict[str, int]:
 
 def sample_functions(model: CellModel) -> dict[str, ca.Function]:
     """Build the evaluation of a candidate in parts that are composed sample by sample, by name.
-    There are none for drivable cells.
+    There are none for drivable cells. An arm's state is the input of
+    `symbolic.robot.arm.track_function`.
 
-    path: x (n_var,) -> time (1, n); pose (6 + m, n), extended by the m redundant joints; rate and
-    second_rate (6, n).
-
-    start: first pose, joints of both arms at the start -> state_1 and state_2, each arm's state
-    before the first sample.
-
-    predict: state_1 and state_2 after the first sample, second pose -> both states with the change
-    of the joints to the second sample.
-
-    sample: pose, rate, second_rate, state_1, state_2 -> next_state_1, next_state_2, then the
-    outputs named by `sample_sizes`. Where `forces_come_last`, the outputs of forces are zero.
-
-    forces, only where `forces_come_last`: pose, rate, second_rate, joints of both arms -> the
-    outputs named by `force_sizes`.
+    - path takes x (n_var,). It returns time (1, n); pose (6 + m, n), the extended poses; rate and
+      second_rate (6, n), the time derivatives of the box pose.
+    - start takes the first pose and the joints of both arms at the start. It returns state_1 and
+      state_2, each arm's state before the first sample.
+    - predict takes state_1 and state_2 after the first sample and the second pose. It returns both
+      states with the predicted change of the joints to the second sample.
+    - sample takes pose, rate, second_rate, state_1 and state_2. It returns next_state_1,
+      next_state_2, then the outputs named by `sample_sizes`. Where `forces_come_last`, the outputs
+      of forces are zero.
+    - forces exists only where `forces_come_last`. It takes pose, rate, second_rate and the joints
+      of both arms, and returns the outputs named by `force_sizes`.
 
     The last inputs of each function are the parameter groups that `kernel_numbers` names.
     """
@@ -292,7 +290,8 @@ def sample_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def kernel_numbers(workcell: Workcell, screen: Screen) -> dict[str, tuple[str, ...]]:
-    """Return which parameter groups each function of `kernel_functions` takes as its last inputs.
+    """Return the names of the parameter groups that each function of `kernel_functions` takes as
+    its last inputs.
 
     Args:
         workcell: the cell, with symbols as parameters.
@@ -315,12 +314,14 @@ def _forces_function(
     load: dict[str, ca.MX],
     handed: dict[str, ca.MX],
 ) -> ca.Function:
-    """Build the function `forces` that `sample_functions` describes.
+    """Build the function `forces` that `sample_functions` describes: contact forces, joint torques
+    and their constraints at one sample.
 
     Args:
         model: model of the cell.
-        motion: symbols of the box's motion at one sample; the first is the pose.
-        load: expressions of the loads on the contacts, by name.
+        motion: symbols of the extended pose, and of the first and second time derivative (6,) of
+            the box pose.
+        load: expressions of the outputs `symbolic.contact.load.LOAD_OUTPUTS`, by name.
         handed: symbolic parameters of the cell, by group.
     """
     workcell = model.workcell
@@ -407,8 +408,12 @@ def _row_max(matrix: ca.MX) -> ca.MX:
 
 
 def _time_share(time: ca.MX) -> ca.MX:
-    """Compute the share (1, n) of the duration that each sample represents: half the steps before
-    and after it. `time` are the n times [s]."""
+    """Compute the share (1, n) of the duration that each sample represents: half the time steps
+    before and after it.
+
+    Args:
+        time: (1, n) times of the samples [s].
+    """
     steps = time[:, 1:] - time[:, :-1]
     return (ca.horzcat(0.0, steps) + ca.horzcat(steps, 0.0)) / (2.0 * time[-1])
 

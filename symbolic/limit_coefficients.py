@@ -155,11 +155,12 @@ def limit_numbers(workcell: Workcell) -> dict[str, ca.SX]:
 
 
 def _contact_load(workcell: Workcell, blocks: dict[str, ca.SX], a: ca.SX, w: ca.SX) -> ContactLoad:
-    """Return the load on the contacts at one sample, along the axes of contact 1.
+    """Return the load on the contacts at one sample, with all vectors along the axes of contact 1.
 
     Args:
         workcell: the cell.
-        blocks: the blocks force and moment of `limit_layout`.
+        blocks: by name, the block force (9,) of `limit_layout`, required force by u'', by u'^2 and
+            at rest [N], and the block moment (6,), required moment by u'' and by u'^2 [N m].
         a: second time derivative u'' of the path parameter.
         w: square u'^2 of its first time derivative.
     """
@@ -214,11 +215,12 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
 
 
 def _load_function(workcell: Workcell) -> ca.Function:
-    """Build the function of the load (6,) about the box frame's origin, along the box's axes [N, N
-    m], and of its derivatives (6, 2) by u'' and u'^2.
+    """Build the function of the load that the pads have to balance, and of its derivatives by the
+    timing.
 
-    Inputs: the blocks force and moment of `limit_layout` (15,), u'', u'^2, and the payload's
-    parameters.
+    Inputs: the blocks force and moment of `limit_layout` as one vector (15,), u'', u'^2, and the
+    payload's parameters. Outputs: force and moment (6,) about the box frame's origin, along the
+    box's axes [N, N m]; and its derivatives (6, 2) by u'' and u'^2.
     """
     size = limit_layout(workcell).sizes["force"]
     payload = workcell.payload
@@ -333,8 +335,8 @@ def contact_limits(
 
 
 def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
-    """Build the functions `limit_ratios` and `limit_slopes` for cells whose forces need a convex
-    program."""
+    """Build the functions `limit_ratios` and `limit_slopes` that `ratio_functions` describes, for
+    cells whose forces a convex program computes."""
     layout = limit_layout(workcell)
     sizes, joints = layout.sizes, layout.joints
     names = ("force", "moment", "torque", "wrench")
@@ -371,11 +373,11 @@ def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
 
 
 def _inputs(workcell: Workcell, blocks: dict[str, ca.SX]) -> dict[str, ca.SX]:
-    """Return the inputs of the function `limit_forces`, as symbols by name.
+    """Return the inputs of the function `limit_forces` of `force_functions`, as symbols by name.
 
     Args:
         workcell: the cell.
-        blocks: symbols of the blocks of one sample's limits.
+        blocks: symbols of the blocks force (9,) and moment (6,) of `limit_layout`, by name.
     """
     timing = {name: ca.SX.sym(name) for name in ("a", "w")}
     return {"sample": ca.vertcat(*blocks.values())} | timing | sx_parameters(workcell.payload)
@@ -389,8 +391,9 @@ def _slopes(
     Args:
         name: name of the function.
         value: the expression.
-        inputs: inputs of the function by name; `a` and `w` are among them.
-        implicit: variables that an equation determines; they are the last input, `solved`.
+        inputs: symbols of the function's inputs by name; `a` and `w` are among them.
+        implicit: collector of results of Newton's method. These results are the function's last
+            input, called `solved`.
     """
     value = ca.densify(value)
     by = {f"by_{z}": ca.densify(ca.jacobian(value, inputs[z])) for z in ("a", "w")}

@@ -37,8 +37,8 @@ def layer_shares(pads: Sequence[Contact]) -> Array:
 
 
 def pressure_shifts(workcell: Workcell, load: Array, normal: Array) -> Array:
-    """Compute how far the centres of pressure shift, relative to the shift at which the pressure at
-    a rim vanishes.
+    """Compute how far the centres of pressure shift, as a share of the shift at which the pressure
+    at a point of the rim vanishes.
 
     Args:
         workcell: cell whose pads share each robot's normal force in proportion to their areas.
@@ -47,7 +47,7 @@ def pressure_shifts(workcell: Workcell, load: Array, normal: Array) -> Array:
         normal: (n, 2) normal forces of the robots [N].
 
     Returns:
-        (n, 2) largest ratio of each robot's pads; a rim lifts off above 1.
+        (n, 2) largest share among each robot's pads. A rim lifts off if it exceeds 1.
     """
     pads, robots = workcell.pads, workcell.pad_robots
     area = np.array([pad.area for pad in pads])

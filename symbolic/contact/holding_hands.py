@@ -166,11 +166,16 @@ def internal_force_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Arra
 
 
 def _most_sliding(along: Array, torsion: Array, kappa: float) -> float:
-    """Compute the largest |T f|^2 + (s f)^2 + kappa |T f| |s f| of any unit vector f, with
-    `along` T (2, 3) and `torsion` s (3,).
+    """Compute an upper bound of |T f|^2 + (s . f)^2 + kappa |T f| |s . f| over all unit vectors f
+    (3,).
 
-    A product of two lengths is at most half of q times one squared plus the other squared over q,
-    for every q; the least of these bounds is taken.
+    For every q > 0 the product |T f| |s . f| is at most half of q |T f|^2 + (s . f)^2 / q. The
+    result is the least bound over several q.
+
+    Args:
+        along: (2, 3) matrix T.
+        torsion: (3,) vector s.
+        kappa: the factor kappa.
     """
     first, second = along.T @ along, np.outer(torsion, torsion)
     bounds = (
@@ -355,7 +360,8 @@ class HoldingHands(ContactModel):
 
     def raised(self, planned: Array, extra: Array, leader: int) -> Array:
         """Compute the holding forces (n, 2) [N] after a rise. Both columns are the raised force of
-        the robot that does not lead, because the hands of both arms hold with the same share.
+        the robot that does not lead, because the hands of both arms hold with the same share of
+        their holding forces.
 
         Args:
             planned: (n, 2) planned holding forces [N].
@@ -382,8 +388,12 @@ class HoldingHands(ContactModel):
         return 0.0 * along, stiffness / 2.0 * np.hypot(along, across) * most
 
     def _opposed_need(self, friction: Expression) -> Expression:
-        """Compute the largest additional holding force that any hand needs, per newton with which
-        the arms push against each other."""
+        """Compute the largest additional holding force that any hand needs, in newtons per newton
+        with which the arms push against each other.
+
+        Args:
+            friction: (2,) Coulomb coefficients of the arms' hands.
+        """
         most = ca.SX(0.0)
         for i, own in zip(self.workcell.pad_robots, self.pad_parameters, strict=True):
             a, b, c, lifting = ca.vertsplit(ca.vec(number(own["opposed"])))

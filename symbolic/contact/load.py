@@ -146,7 +146,8 @@ def _closed_load_function(workcell: Workcell) -> ca.Function:
 
 
 def _grasp_load_function(workcell: Workcell) -> ca.Function:
-    """Build the function `uncertain_load` for pads whose forces a convex program computes."""
+    """Build the function that `uncertain_load_function` describes, for pads whose forces a convex
+    program computes."""
     inputs = {name: ca.MX.sym(name, size) for name, size in SIZES.items()}
     names = ("angular_velocity", "angular_acceleration", "force", "required_moment")
     given = [ca.SX.sym(name, size) for name, size in SIZES.items() if name != "friction"]
@@ -163,8 +164,12 @@ def _grasp_load_function(workcell: Workcell) -> ca.Function:
 
 
 def _named(inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
-    """Build the function `uncertain_load`, whose outputs are `LOAD_OUTPUTS`, from its inputs and
-    outputs by name."""
+    """Build the CasADi function `uncertain_load` with the outputs `LOAD_OUTPUTS`.
+
+    Args:
+        inputs: symbols by name, in order.
+        outputs: expressions by name, at least those in `LOAD_OUTPUTS`.
+    """
     ordered = {name: outputs[name] for name in LOAD_OUTPUTS}
     return named_function("uncertain_load", inputs, ordered, cse=False)
 
@@ -195,8 +200,12 @@ def required(
 
 
 def _sample_function(workcell: Workcell) -> ca.Function:
-    """Build the function from the inputs `SAMPLE_SIZES` to the outputs `GRASP_OUTPUTS`, for pads
-    with any normals at one sample."""
+    """Build the function of the pads' forces at one sample, for pads with any normals.
+
+    Inputs: `SAMPLE_SIZES` (pose, required force and moment about the centre of mass along world
+    axes, friction, centre of mass), then the payload's symbolic parameters. Outputs:
+    `GRASP_OUTPUTS`.
+    """
     inputs, given = [ca.MX.sym(*entry) for entry in SAMPLE_SIZES], mx_parameters(workcell.payload)
     pose, force, moment, friction, centre_of_mass = inputs
     asked = (pose, force, moment, centre_of_mass)
@@ -235,11 +244,11 @@ _ASKED = (("pose", 6), ("force", 3), ("moment", 3), ("centre_of_mass", 3))
 
 
 def box_load_function(workcell: Workcell) -> ca.Function:
-    """Build the function that converts the required force and moment to force and moment (6,) about
-    the box frame's origin, along the box's axes [N, N m].
+    """Build the function that converts the force and moment on the box from world to box frame.
 
-    Inputs: pose (6,); force (3,) and moment (3,) about the centre of mass, world axes;
-    centre_of_mass (3,), box frame [m].
+    Inputs: pose (6,) of the box; force (3,) [N] and moment (3,) about the centre of mass [N m],
+    both along world axes; centre_of_mass (3,), box frame [m]. Output (6,): force [N] and moment
+    about the box frame's origin [N m], along the box's axes.
     """
     pose, force, moment, centre_of_mass = inputs = [ca.SX.sym(*entry) for entry in _ASKED]
     to_box = rotation_matrix(workcell.task.orientation, pose[3:]).T

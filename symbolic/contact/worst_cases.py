@@ -161,12 +161,14 @@ def case_slopes_function(workcell: Workcell) -> ca.Function:
 
 
 def case_excess_function(workcell: Workcell) -> ca.Function:
-    """Build the function of the normal force of robot 1 in one case, minus
-    `ContactModel.leading_share` times the commanded force of robot 2
-    (`ContactModel.leading_excess`).
+    """Build the function of the constant part of robot 1's normal force in one case of the
+    uncertainty.
+
+    With a commanded force F of robot 2, the normal force of robot 1 is excess + share F. The share
+    is `ContactModel.leading_share`, and excess the scalar output [N].
 
     Inputs: pose, rate, second_rate (6,), the box pose and its time derivatives; case (18,), laid
-    out by `CASE_SIZES`; then the payload's symbolic parameters. Output: excess, a scalar [N].
+    out by `CASE_SIZES`; then the payload's symbolic parameters.
     """
     inputs = _inputs(ca.SX, sx_parameters(workcell.payload))
     load, opposed = case_contact_load(workcell, inputs), case_parts(inputs["case"])[-1]
@@ -210,14 +212,16 @@ def case_slack_function(workcell: Workcell, commanded: int = 1) -> ca.Function:
 def _program_and_inputs(
     workcell: Workcell, commanded: int = 1
 ) -> tuple[GraspSqueeze | None, dict[str, Expression]]:
-    """Return the convex program of pads with any normals, None for other pads; and the inputs by
-    name.
-
-    The inputs are those of functions that compute least forces.
+    """Return what functions of least normal forces are built from.
 
     Args:
         workcell: the cell.
         commanded: index of the robot that is commanded by force.
+
+    Returns:
+        The convex program that computes the forces of pads with any normals, None for other pads;
+        and the symbols of the functions' inputs by name: motion, case of the uncertainty,
+        parameters.
     """
     if command_model(workcell).has_scalar_squeeze:
         return None, _inputs(ca.SX, sx_parameters(workcell.payload))
@@ -226,8 +230,8 @@ def _program_and_inputs(
 
 
 def _inputs(kind: Any, given: Mapping[str, Expression]) -> dict[str, Expression]:
-    """Return symbols by name: pose, rate, second_rate (6,) and case (18,), then the parameters
-    `given`.
+    """Return symbols by name: pose, rate and second_rate (6,), the box pose and its time
+    derivatives; case (18,), a case of the uncertainty; then the parameters.
 
     Args:
         kind: type of the symbols, SX or MX.
@@ -246,17 +250,18 @@ def _least_force(
     displaced: bool = False,
     beside: Expression | float = 0.0,
 ) -> Expression:
-    """Build the expression of the least commanded normal forces (2,) in one case [N].
+    """Build the expression of the least commanded normal forces (2,) in one case of the uncertainty
+    [N].
 
     Args:
         workcell: the workcell.
         squeeze: convex program of pads with any normals; None for other pads.
-        inputs: symbols by name: motion, case and parameters.
+        inputs: symbols by name: pose, rate, second_rate (6,), case (18,), and parameters by group.
         implicit: collector of results of Newton's method, for exact derivatives; None for none.
-        differentiable: True for exact first derivatives of the program's solution.
+        differentiable: True for exact first derivatives of the convex program's solution.
         displaced: True if the case may displace two opposite pads.
-        beside: additional load (6,) about the box frame's origin [N, N m], for pads with any
-            normals.
+        beside: additional force and moment (6,) about the box frame's origin [N, N m], for pads
+            with any normals.
     """
     case = inputs["case"]
     friction, *_ = case_parts(case)
@@ -277,8 +282,8 @@ def _origin_load(workcell: Workcell, inputs: dict[str, Expression]) -> Expressio
 
 
 def case_parts(case: ca.SX | ca.MX) -> list[ca.SX | ca.MX]:
-    """Split a case (18,) into its parts, such as friction (2,) and mass (1,), in the order of
-    `CASE_SIZES`."""
+    """Split a case of the uncertainty (18,) into its parts, such as friction (2,) and mass (1,), in
+    the order of `CASE_SIZES`."""
     return list(ca.vertsplit(case, [0, *accumulate(CASE_SIZES.values())]))
 
 
@@ -343,8 +348,8 @@ def _commanded_by_program(
 
     Args:
         squeeze: convex program of the least commanded force.
-        load: (6,) load in this case.
-        case: (18,) case of the uncertainty.
+        load: (6,) force and moment about the box frame's origin, along the box's axes [N, N m].
+        case: (18,) case of the uncertainty, laid out by `CASE_SIZES`.
         handed: symbolic parameters of the cell by group.
         differentiable: True for exact first derivatives.
     """
@@ -362,8 +367,8 @@ def _commanded_by_program(
 
 
 def _sizes_function(squeeze: GraspSqueeze) -> ca.Function:
-    """Build the function from a case (18,) to the sizes (2,) of the robots' patches over the cell's
-    own sizes."""
+    """Build the function from a case (18,) of the uncertainty to the sizes (2,) of both robots'
+    patches in this case, over the sizes in the cell."""
     case = ca.SX.sym("case", CASE_SIZE)
     radius = case_parts(case)[1]
     own = [ca.SX(number(contact.patch_radius)) for contact in squeeze.workcell.contacts]

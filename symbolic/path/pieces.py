@@ -108,10 +108,12 @@ def hierarchical_basis(task: Task) -> tuple[Array, Array]:
 
 
 def _steps(pieces: int) -> list[int]:
-    """Return the spacing of the waypoints in each grid, from the coarsest to 1.
+    """Return the spacing of the waypoints in each grid, from the coarsest grid to 1.
 
-    The spacing is counted in waypoints of the refined task, which has `pieces` pieces per original
-    one.
+    The spacing is counted in waypoints of the refined task.
+
+    Args:
+        pieces: number of pieces between two waypoints of the file in the refined task.
     """
     steps = [pieces]
     while steps[-1] > 1:
@@ -145,8 +147,8 @@ def resample_decisions(x: Array, source: Task, target: Task) -> Array:
 
 @cache
 def _through(n: int, m: int) -> Array:
-    """Compute the matrix (m, n) from n waypoints to m points of their spline, evenly spaced
-    in u."""
+    """Compute the matrix (m, n) that maps n waypoints to m points of the natural quintic spline
+    through them, evenly spaced in u."""
     u = np.linspace(0.0, 1.0, m)
     by = path_position(n, u).copy()
     known, where = np.divmod(np.arange(m) * (n - 1), m - 1)

@@ -73,8 +73,11 @@ Quaternion = tuple[Expression, Expression]
 
 
 def _quaternion(v: Expression) -> Quaternion:
-    """Compute the unit quaternion (real part, vector part (3,)) of a rotation vector `v` (3,)
-    [rad]."""
+    """Compute the unit quaternion of a rotation vector `v` (3,) [rad].
+
+    Returns:
+        Real part (scalar) and vector part (3,).
+    """
     square = ca.sumsqr(v)
     return _series(_COSINE, square), _series(_SINE, square) * v
 
@@ -86,7 +89,10 @@ def _quaternion_rates(
 
     Args:
         v: (3,) rotation vector [rad].
-        rate, second: (3,) its first and second time derivative.
+        rate, second: (3,) its first and second time derivative [rad/s, rad/s^2].
+
+    Returns:
+        The first, then the second derivative, each as real part (scalar) and vector part (3,).
     """
     square = ca.sumsqr(v)
     moved, pushed = 2.0 * ca.dot(v, rate), 2.0 * (ca.sumsqr(rate) + ca.dot(v, second))
@@ -101,12 +107,13 @@ def _quaternion_rates(
 def _derivatives(
     series: Sequence[float], square: Expression, moved: Expression, pushed: Expression
 ) -> Quaternion:
-    """Compute the first and second time derivative of a power series in one variable.
+    """Compute the first and second time derivative of the power series sum_n c_n s^n of a variable
+    s.
 
     Args:
-        series: coefficients of the series.
-        square: the variable.
-        moved, pushed: its first and second time derivative.
+        series: coefficients c_n, from n = 0.
+        square: the variable s.
+        moved, pushed: first and second time derivative of s.
     """
     first = [n * c for n, c in enumerate(series)][1:]
     slope = _series(first, square)
@@ -122,11 +129,12 @@ def _series(coefficients: Sequence[float], x: Expression) -> Expression:
 
 
 def _turned(w: Expression, u: Expression, w_rate: Expression, u_rate: Expression) -> Expression:
-    """Compute the vector part (3,) of 2 q' q* for a quaternion q.
+    """Compute the vector part (3,) of 2 q' q* for a quaternion q, with q' its time derivative and
+    q* its conjugate. For a unit quaternion this is the angular velocity.
 
     Args:
         w, u: real part and vector part (3,) of q.
-        w_rate, u_rate: their time derivatives.
+        w_rate, u_rate: real part and vector part (3,) of q'.
     """
     return 2.0 * (w * u_rate - w_rate * u + ca.cross(u, u_rate))
 

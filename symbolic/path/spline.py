@@ -98,13 +98,14 @@ NONE: Handed = MappingProxyType({})
 
 
 def _fixed(task: Task, value: Any, x: Expression, handed: Handed) -> Expression:
-    """Return a parameter of the task as an expression of the type of `x`.
+    """Return a parameter of the task as an expression of the type of the decision vector, SX or MX.
 
     Args:
         task: the task.
         value: number or symbolic expression of the parameter.
-        x: expression whose type the result has.
-        handed: symbolic parameters of the task by group.
+        x: decision vector, whose type the result has.
+        handed: MX inputs that hold the task's symbolic parameters, by group; empty for plain
+            numbers.
     """
     if isinstance(x, ca.MX) and isinstance(value, ca.SX):
         return as_mx(value, sx_parameters(task), handed)

@@ -123,13 +123,16 @@ def _constant(task: Task, pose: ca.MX, rounding: ca.MX | None, handed: Handed) -
 
 
 def _step_time_function(task: Task, is_rounded: bool) -> ca.Function:
-    """Build the function that returns the duration [s] of the step from a start pose (6,) to an end
-    pose (6,) [m, rad] (paper Eqs. 23-24).
+    """Build the function of the duration of a step between two poses at the reference speeds (paper
+    Eqs. 23-24).
+
+    Inputs: start pose (6,) and end pose (6,) [m, rad]; with `is_rounded` the relative width of the
+    smoothing; then the task's symbolic parameters. Output: the duration [s], the larger one of
+    translation and rotation time.
 
     Args:
         task: task with the reference speeds.
-        is_rounded: True to smooth the maximum of translation and rotation time; the third input is
-            then the relative width of the smoothing.
+        is_rounded: True to smooth the maximum of translation and rotation time.
     """
     start, end, given = ca.SX.sym("start", 6), ca.SX.sym("end", 6), sx_parameters(task).values()
     step = end - start
@@ -147,8 +150,13 @@ def _step_time_function(task: Task, is_rounded: bool) -> ca.Function:
 
 
 def _gradient(values: ca.MX, durations: ca.MX) -> ca.MX:
-    """Compute time derivatives of `values` (k, n) at n samples by second-order finite differences,
-    one-sided at the ends; `durations` (1, n - 1) are the steps in time."""
+    """Compute time derivatives (k, n) of tabulated values by second-order finite differences,
+    one-sided at the ends.
+
+    Args:
+        values: (k, n) values at n samples.
+        durations: (1, n - 1) time steps between the samples [s].
+    """
     rows = values.shape[0]
     before, after = durations[:, :-1], durations[:, 1:]
     step = ca.repmat(1.0, rows, 1)
@@ -163,12 +171,12 @@ def _gradient(values: ca.MX, durations: ca.MX) -> ca.MX:
 
 
 def _one_sided(here: ca.MX, near: ca.MX, far: ca.MX, near_step: ca.MX, far_step: ca.MX) -> ca.MX:
-    """Compute the derivative at the first of three values of the parabola through them.
+    """Compute the time derivative of the parabola through three values, at the first of them.
 
     Args:
         here, near, far: the values; the derivative is at `here`.
-        near_step, far_step: time from `here` to `near` and from `near` to `far` [s], both negative
-            if they lead backwards.
+        near_step, far_step: time from `here` to `near` and from `near` to `far` [s]; both are
+            negative if `near` and `far` are earlier than `here`.
     """
     total = near_step + far_step
     return (
@@ -197,11 +205,11 @@ def _ramped(
 
 
 def _length_rate_function(task: Task) -> ca.Function:
-    """Build the function from pose, first and second derivative by u, (6,) each, to the arc length
-    per unit of u [m] and its derivative by u.
+    """Build the function of the arc length per unit of u [m] and its derivative by u.
 
-    A rotation counts as a length by the ratio of the reference speeds; the longer of translation
-    and rotation is the arc length.
+    Inputs: pose (6,) of the box [m, rad], its first and second derivative by u (6,), then the
+    task's symbolic parameters. The arc length is the longer of translation and rotation. A rotation
+    counts as its angle times reference speed over reference angular speed.
     """
     pose, first, second = (ca.SX.sym(name, 6) for name in ("pose", "first", "second"))
     lever = task.reference_speed / task.reference_angular_speed
@@ -217,8 +225,11 @@ def _length_rate_function(task: Task) -> ca.Function:
 
 
 def _ramp_function(task: Task) -> ca.Function:
-    """Build the function from arc length and total arc length [m] to time [s], speed [m/s] and
-    acceleration [m/s^2] of a smooth motion from rest to rest."""
+    """Build the function of a smooth motion from rest to rest.
+
+    Inputs: arc length so far [m], total arc length [m], then the task's symbolic parameters.
+    Outputs at this arc length: time [s], speed [m/s] and acceleration [m/s^2].
+    """
     arc, total = ca.SX.sym("arc"), ca.SX.sym("total")
     ramp = task.ramp_time
     cruise = ca.fmin(task.reference_speed, total / ramp)

@@ -187,14 +187,21 @@ def torque_function(robot: Robot, model: RobotModel, contact: Contact, name: str
 def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str, ca.Function]:
     """Build the steps of `track_function` as functions by name.
 
-    Conditional steps copy their input if the condition is false.
+    A target is R_world_box and the flange's rotation and position that hold the box. A placement is
+    joints, pose residual [m, rad] and flange Jacobian (6, n).
 
-    target: pose -> R_world_box, and the flange's target. approach: state, pose, target -> joints
-    after `CHEAP_STEPS`, and the residual before the last step. closer: joints, target -> joints
-    after one more step. place: joints, target -> joints, residual, jacobian. again: state, pose,
-    target, result of `place` -> the better of this result and `IK_NEWTON_STEPS` steps by QR. held:
-    previous joints, target, result so far -> result of `place` at the previous joints. measures:
-    joints, jacobian, R_world_box, wrench -> limit margin, manipulability, joint torque.
+    - target: extended pose -> target.
+    - approach: state, pose, target -> joints after `CHEAP_STEPS`, residual before the last step.
+    - closer: joints, target -> joints after one more step, if the condition holds.
+    - place: joints, target -> placement.
+    - again: state, pose, target, placement -> the better one of this placement and of the placement
+      after `IK_NEWTON_STEPS` steps by QR, if the condition holds.
+    - held: previous joints, target, placement -> placement at the previous joints, if the condition
+      holds.
+    - measures: joints, Jacobian, R_world_box, wrench -> limit margin, manipulability, joint torque.
+
+    The functions with a condition take it as their first input, and copy their input if it is
+    false.
 
     Args:
         robot, model, contact: the arm, its model, and its contact with the box.
@@ -239,15 +246,15 @@ def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str,
 
 
 def _placed(model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX) -> list[ca.SX]:
-    """Return joints q with the residual and the Jacobian there.
+    """Return joint positions together with the pose residual and the flange's Jacobian at them.
 
     Args:
         model: model of the robot.
-        q: (n,) joint positions.
-        R_target, p_target: rotation (3, 3) and position (3,) that the flange should have.
+        q: (n,) joint positions [rad or m].
+        R_target, p_target: wanted rotation (3, 3) and position (3,) [m] of the flange in the root.
 
     Returns:
-        The joints (n,), their pose residual from the target [m, rad], the flange's Jacobian (6, n).
+        q unchanged; the residual, a scalar [m, rad]; and the Jacobian (6, n).
     """
     R, p, jacobian = model.kinematics(q)
     return [q, pose_error(R_target, p_target, R, p)[1], jacobian]
@@ -260,11 +267,12 @@ def _function(name: str, inputs: list[ca.SX], outputs: list[ca.SX]) -> ca.Functi
 def _where(
     name: str, inputs: list[ca.SX], results: list[ca.SX], otherwise: list[ca.SX]
 ) -> ca.Function:
-    """Build a function that returns expressions if its first input is true, else other expressions.
+    """Build a function that returns some expressions if its first input, a condition, is true, and
+    other expressions if it is false.
 
     Args:
         name: name of the function.
-        inputs: inputs after the condition.
+        inputs: symbols of the inputs after the condition.
         results: expressions if the condition is true.
         otherwise: expressions of the same shapes if it is false.
     """
@@ -411,16 +419,16 @@ _POSTURES = 200
 
 
 def pose_error(R_target: ca.SX, p_target: ca.SX, R: ca.SX, p: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Compute the error of a flange placement: Newton's right-hand side (6,), and the scalar
-    residual.
-
-    The right-hand side holds the position error [m], then the axis of the rotation error times the
-    sine of its angle. The residual contains twice the sine of the half angle instead, which is zero
-    for equal rotations only.
+    """Compute the wanted minus the actual placement of a flange, in two forms.
 
     Args:
         R_target, p_target: wanted rotation (3, 3) and position (3,) [m] of the flange.
         R, p: actual rotation (3, 3) and position (3,) [m] in the same frame.
+
+    Returns:
+        Right-hand side (6,) of a Newton step: position error [m], then rotation axis times the sine
+        of the error's angle. Scalar residual: the root of the summed squares of the position error
+        [m] and of twice the sine of half the angle, which is zero for equal rotations only.
     """
     dR = ca.mtimes(R_target, R.T)
     axis = ca.vertcat(dR[2, 1] - dR[1, 2], dR[0, 2] - dR[2, 0], dR[1, 0] - dR[0, 1]) / 2.0
@@ -447,8 +455,8 @@ def newton_step(model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX) -
 def block_step(
     model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX
 ) -> tuple[ca.SX, ca.SX]:
-    """Return the joints (n,) after a Newton step with few operations, and the pose residual before
-    it.
+    """Return the joints (n,) after a Newton step that needs few operations, and the pose residual
+    before the step [m, rad].
 
     The step solves two 3 by 3 systems by Cramer's rule: the angular rows of the Jacobian give three
     joints in terms of the other three, which follow from the linear rows. Without pivoting the step
@@ -480,7 +488,7 @@ def block_step(
 
 
 def _cramer(A: ca.SX) -> Callable[[ca.SX], ca.SX]:
-    """Return a solver of A x = b, A (3, 3), for right-hand sides b (3,)."""
+    """Return a function that solves A x = b, with A (3, 3), for right sides b (3,)."""
     a, b, c = A[:, 0], A[:, 1], A[:, 2]
     rows = ca.cross(b, c), ca.cross(c, a), ca.cross(a, b)
     # The guard keeps CasADi from turning the products with a reciprocal into divisions.
@@ -519,8 +527,8 @@ def _limited(model: RobotModel, q: ca.SX, step: ca.SX) -> ca.SX:
 
     Args:
         model: model of the robot.
-        q: (n,) joint positions before the step.
-        step: (6,) change of the six joints.
+        q: (n,) joint positions before the step [rad or m].
+        step: (6,) change of the six joints [rad or m].
     """
     largest = ca.norm_inf(step)
     # At a singular posture the step is not a number: stay, and let the residual tell.
@@ -551,8 +559,8 @@ def _others(joints: tuple[int, ...]) -> tuple[int, ...]:
 
 
 def _minors(rows: ca.SX) -> dict[tuple[int, ...], ca.SX]:
-    """Compute the determinants of all 3 by 3 submatrices of rows (3, 6), by the indices of their
-    columns."""
+    """Compute the determinants of all 3 by 3 submatrices of a matrix `rows` (3, 6). The key is the
+    triple of their column indices."""
     pairs = {
         (i, j): rows[1, i] * rows[2, j] - rows[1, j] * rows[2, i]
         for i, j in combinations(range(6), 2)

@@ -254,11 +254,11 @@ def _spread(count: int) -> Array:
 
 
 def _distinct(q: Array) -> Array:
-    """Return the postures (rows of q) that differ from all earlier ones by more than
-    `BRANCH_TOLERANCE`.
+    """Return those postures that differ from all earlier ones by more than `BRANCH_TOLERANCE`.
 
     Args:
-        q: (m, n) joint positions [rad]; positions that differ by full turns count as equal.
+        q: (m, n) joint positions of m postures [rad]; positions that differ by full turns count as
+            equal.
     """
     kept = []
     while len(q):
@@ -342,13 +342,13 @@ def start_branches(
 
 
 def start_flange(workcell: Workcell, robot: Robot, contact: Contact) -> Array:
-    """Compute the flange pose in the robot's root, T_root_flange (4, 4), with the box at the first
-    waypoint.
+    """Compute the flange pose in the robot's root, T_root_flange (4, 4), at which the robot holds
+    the box at the first waypoint.
 
     Args:
         workcell: the cell.
         robot: the robot.
-        contact: its contact with the box.
+        contact: the robot's contact with the box.
     """
     start = workcell.task.waypoints[0].lower
     T_world_box = box_placement(workcell.task.orientation, start)

@@ -123,11 +123,11 @@ class RobotModel:
 
     @cached_property
     def drift(self) -> casadi.Function:
-        """Function from q and v to drift (6,), the flange's acceleration if the joint accelerations
-        a are zero.
+        """Function from q and v (n,) to drift (6,), the flange's acceleration if all joint
+        accelerations are zero.
 
-        The classical acceleration of the flange is jacobian @ a + drift [m/s^2, rad/s^2], with rows
-        as in `jacobian`.
+        With joint accelerations a (n,), the flange's classical acceleration is jacobian @ a + drift
+        [m/s^2, rad/s^2], with rows as in `jacobian`.
         """
         return bridge.frame_drift(self.model, self.flange_id)
 

@@ -88,9 +88,13 @@ def driven_layout(workcell: Workcell) -> DrivenLayout:
 
 
 def planned_branches(workcell: Workcell) -> Array:
-    """Return the coefficients (2, b, size) of b linear functions of a point's quantities (size,)
-    for each contact. The largest of a contact's functions is its planned normal force [N]; b is 0
-    if a convex program computes the forces."""
+    """Return linear functions of a point's quantities, the largest of which is a contact's planned
+    normal force [N].
+
+    Returns:
+        Coefficients (2, b, size) of b functions for each contact, by the quantities (size,) of
+        `driven_layout`. b is 0 if a convex program computes the forces.
+    """
     layout, own = driven_layout(workcell), contact_model(workcell).force_branches
     if layout.by_program:
         return np.zeros((2, 0, layout.size))
@@ -102,15 +106,15 @@ def planned_branches(workcell: Workcell) -> Array:
 def driven_functions(model: CellModel) -> dict[str, ca.Function]:
     """Build, by name, the functions of limited quantities at one point of a path that robots drive.
 
-    The variables y are, in order: pose, first and second, the extended pose and its derivatives by
-    u (6 + m,); q_1 and q_2, the joints of both arms; a = u''; w = u'^2. Each function takes them as
-    separate inputs; the cell's symbolic parameters come last.
+    Inputs of both: pose, first and second (6 + m,), the extended pose and its first and second
+    derivative by u; q_1 and q_2, the joints of both arms; a = u''; w = u'^2. Together these are the
+    variables y. The cell's symbolic parameters come last.
 
-    driven_first returns value (size,), laid out by `driven_layout`, and slope (size, variables),
-    the derivatives by y (NumPy shape).
-
-    driven_second also takes weight (size,) and direction (variables,). It returns change
-    (variables,): the Hessian by y of the scalar product of weight and value, times direction.
+    - driven_first returns value (size,), laid out by `driven_layout`, and slope (size, variables),
+      the derivatives by y (NumPy shape).
+    - driven_second takes two more inputs after y: weight (size,), a factor on each quantity, and
+      direction (variables,). It returns change (variables,): the Hessian by y of the weighted sum
+      of the quantities, times direction.
     """
     layout = driven_layout(model.workcell)
     names = [*PATH_OUTPUTS, "a", "w"]
@@ -138,8 +142,10 @@ def _value(model: CellModel, inputs: list[ca.SX], implicit: ImplicitVariables) -
 
     Args:
         model: model of the cell.
-        inputs: inputs of `driven_functions`; the last two are a = u'' and w = u'^2.
-        implicit: variables of the contact forces that an equation determines.
+        inputs: extended pose (6 + m,), its first and second derivative by u, joint positions of
+            both arms, u'' and u'^2, each one expression.
+        implicit: collector of results of Newton's method for the contact forces, for exact
+            derivatives.
     """
     workcell = model.workcell
     limits, joints = limit_layout(workcell), limit_layout(workcell).joints

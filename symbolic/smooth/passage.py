@@ -41,8 +41,8 @@ DIRECTION_NUMBERS = 12
 
 
 def _directions() -> Array:
-    """Return one row of coefficients per separating direction, (SEPARATING_DIRECTIONS,
-    DIRECTION_NUMBERS), with the obstacle's vectors along the obstacle's axes."""
+    """Return the coefficients of all separating directions, one row each: (SEPARATING_DIRECTIONS,
+    DIRECTION_NUMBERS). The obstacle's vectors are along the obstacle's own axes."""
     found = []
     for first, axes in ((0, 1), (3, 1), (6, 3)):
         for k in range(3):
@@ -80,13 +80,14 @@ def direction_numbers(obstacle: Array, k: int) -> Array:
 
 
 def direction(place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-    """Return a separating direction (3,) in the world frame, not normalised.
+    """Return a direction (3,), world frame, that may separate an obstacle from the payload. It is
+    not normalised.
 
     The direction is the sum of three terms, two of which are zero: an axis of the obstacle, an axis
     of the payload, and the cross product of an edge of the obstacle and an edge of the payload.
 
     Args:
-        place: symbols of a place of the path.
+        place: symbols of box pose and joints at one point of the path.
         numbers: (DIRECTION_NUMBERS,) four vectors (3,): axis of the obstacle, world frame; axis of
             the payload, box frame; edge of the obstacle, world frame; edge of the payload, box
             frame.
@@ -169,11 +170,12 @@ class AxisSwitchGap(PathConstraint):
     moving: ClassVar[bool] = True
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Build the expression of the height [m] at which the two gaps, linear along the path, are
+        """Build the expression of a gap [m] at the kink where one separating direction takes over
+        from another: both gaps, extended linearly along the path, have this value where they are
         equal.
 
         Args:
-            place: symbols of a place of the path near the kink.
+            place: symbols of box pose and joints at a point of the path near the kink.
             numbers: (count,) parameters of the obstacle, then coefficients of the directions before
                 and after the kink.
         """

@@ -336,16 +336,15 @@ def row_function(place: PathPointSymbols, constraint: PathConstraint, order: Ord
 def closure_functions(model: CellModel, arm: int) -> dict[str, ca.Function]:
     """Build the functions with which an arm's joints follow the box pose, by name.
 
-    F(pose, q) = 0 are the equations that fix the joints q (n,) at an extended pose (6 + m,) with m
-    redundant joints; c is a constrained value, and F_q, c_q are derivatives by q. The robot's
-    symbolic parameters are the last inputs.
+    F(pose, q) = 0 are the n equations that fix the joints q (n,) at an extended pose (6 + m,) with
+    m redundant joints. The robot's symbolic parameters are the last inputs of both functions.
 
-    first: takes pose, and q_reference (n,), joint positions near the solution. It returns q, the
-    joint positions that hold the box; follow (n, 6 + m), the derivative dq/dpose; and pull (n, n),
-    the matrix -F_q^-1, which gives the multipliers nu = pull^T c_q.
-
-    second: takes pose, q and nu (n,). It returns hessian (6 + m + n, 6 + m + n), the second
-    derivatives of nu . F by pose and q.
+    - first takes pose, and q_reference (n,), joint positions near the solution. It returns q, the
+      joint positions that hold the box; follow (n, 6 + m), the derivative dq/dpose; and pull (n,
+      n), the negative inverse of the derivative of F by q. For a value c of the joints, the
+      multipliers are nu = transposed pull times the gradient of c by q.
+    - second takes pose, q and multipliers nu (n,). It returns hessian (6 + m + n, 6 + m + n), the
+      second derivatives of nu . F by pose and q.
 
     Args:
         model: the cell.

@@ -106,8 +106,7 @@ class SampleBlock:
 
 
 def sample_blocks(task: Task) -> tuple[SampleBlock, ...]:
-    """Divide the samples of a task into blocks; all samples of a block are evaluated by one
-    function."""
+    """Divide the samples of a task into blocks. One function serves all samples of a block."""
     n, position = task.samples, sample_basis(task).position
     if not task.law.has_differences:
         return (SampleBlock("path", np.arange(n)[None, :], position[None]),)
@@ -130,13 +129,12 @@ def sample_functions(workcell: Workcell, quantity: Quantity) -> dict[str, ca.Fun
     the transposed matrix of `SampleBlock.basis`; rounding, the scalar of `timed_path`; then the
     cell's symbolic parameters. In the block 'path' basis and rounding have no effect.
 
-    first: returns values (w k,), sample by sample, and gradient (n_var, w k), one column per value.
-
-    second: also takes weight (w k,) and along (n_var,). It returns curvature (n_var,), the Hessian
-    of the scalar product of weight and values, times along.
-
-    One direction per call makes the code of second derivatives ten times shorter than a whole
-    Hessian, so that it stays in the processor's cache.
+    - first returns values (w k,), sample by sample, and gradient (n_var, w k), one column per
+      value.
+    - second takes two more inputs: weight (w k,), a factor on each value, and along (n_var,), a
+      direction. It returns curvature (n_var,): the Hessian of the weighted sum of the values, times
+      the direction. One direction per call makes the code ten times shorter than a whole Hessian,
+      so that it stays in the processor's cache.
 
     Args:
         workcell: the cell.
@@ -242,14 +240,15 @@ def _at_samples(
     columns: tuple[int, ...],
     handed: dict[str, ca.MX],
 ) -> ca.MX:
-    """Build the expression of a quantity that depends on the motion, at chosen samples, as one
-    column.
+    """Build the expression of a quantity at chosen samples of a path, as one column.
 
     Args:
         workcell: the cell.
-        of_motion: function of pose, rate, second_rate (6,) and the payload's parameters.
-        along: basis, waypoints and rounding for `timed_path`.
-        columns: indices of the samples among those of the basis.
+        of_motion: function of one sample that computes the quantity. Its inputs are pose, rate and
+            second_rate (6,), the box pose and its time derivatives, and the payload's parameters.
+        along: arguments of `timed_path`: spline basis, waypoints (6, n_waypoints), and relative
+            width of the rounding.
+        columns: indices of the chosen samples among those of the basis.
         handed: parameters of task and payload by group.
     """
     path, at = (
@@ -262,8 +261,13 @@ def _at_samples(
 
 
 def _wrench_function(workcell: Workcell) -> ca.Function:
-    """Build the function from pose, rate and second_rate (6,) of a sample to the required force [N]
-    and the required moment about the centre of mass [N m], (6,), box axes."""
+    """Build the function of the force and moment that the box motion requires at one sample, along
+    the box's axes.
+
+    Inputs: pose, rate, second_rate (6,), the box pose [m, rad] and its first and second time
+    derivative; then the payload's symbolic parameters. Output (6,): required force [N], then
+    required moment about the centre of mass [N m].
+    """
     payload = workcell.payload
     pose, rate, second = motion = [ca.SX.sym(name, 6) for name in MOTION_INPUTS]
     centre = number(payload.centre_of_mass)
@@ -273,8 +277,12 @@ def _wrench_function(workcell: Workcell) -> ca.Function:
 
 
 def _margin_function(workcell: Workcell) -> ca.Function:
-    """Build the function from force and moment (6,) about the centre of mass, box axes, to the
-    margin 1 - (shift / patch radius)^2 of each contact's centre of pressure, (2,)."""
+    """Build the function of the margins of both centres of pressure.
+
+    Inputs: required force [N] and moment [N m] about the centre of mass, (6,), along the box's
+    axes; then the payload's symbolic parameters. Output (2,): 1 - (shift / patch radius)^2 for each
+    contact.
+    """
     wrench, contacts = ca.SX.sym("wrench", 6), workcell.contacts
     shift = contact_model(workcell).hold(_contact_load(workcell, wrench))
     squares = ca.vertcat(*map(ca.sumsqr, shift.shifts))
@@ -284,8 +292,12 @@ def _margin_function(workcell: Workcell) -> ca.Function:
 
 
 def _load_function(workcell: Workcell) -> ca.Function:
-    """Build the function from force and moment (6,) about the centre of mass to force and moment
-    (6,) about the box frame's origin, both along the box's axes [N, N m]."""
+    """Build the function that moves the reference point of a load to the box frame's origin.
+
+    Inputs: required force [N] and moment [N m] about the centre of mass, (6,), along the box's
+    axes; then the payload's symbolic parameters. Output (6,): the force, then the moment about the
+    box frame's origin, along the same axes.
+    """
     wrench, centre = ca.SX.sym("wrench", 6), number(workcell.payload.centre_of_mass)
     about = wrench[3:] + ca.cross(ca.SX(centre), wrench[:3])
     given = sx_parameters(workcell.payload).values()
@@ -293,8 +305,12 @@ def _load_function(workcell: Workcell) -> ca.Function:
 
 
 def _force_function(workcell: Workcell) -> ca.Function:
-    """Build the function from force and moment (6,) about the centre of mass, box axes, to the two
-    quantities (2,) of `ContactModel.force_quantities` [N]."""
+    """Build the function of the two quantities `ContactModel.force_quantities`, from which the
+    normal forces follow.
+
+    Inputs: required force [N] and moment [N m] about the centre of mass, (6,), along the box's
+    axes; then the payload's symbolic parameters. Output: the quantities (2,) [N].
+    """
     wrench, model = ca.SX.sym("wrench", 6), contact_model(workcell)
     load = _contact_load(workcell, wrench)
     quantities = model.force_quantities(load, model.hold(load))
@@ -303,11 +319,12 @@ def _force_function(workcell: Workcell) -> ca.Function:
 
 
 def _contact_load(workcell: Workcell, wrench: ca.SX) -> ContactLoad:
-    """Return the load on the contacts along the box's axes.
+    """Return the load on the contacts, with all vectors along the box's axes.
 
     Args:
         workcell: the cell.
-        wrench: (6,) required force and moment about the centre of mass, box axes [N, N m].
+        wrench: (6,) required force [N], then required moment about the centre of mass [N m], box
+            axes.
     """
     contacts, centre = workcell.contacts, workcell.payload.centre_of_mass
     first, second = (ca.SX(number(c.T_box_pad[:3, 3] - centre)) for c in contacts)
