@@ -95,10 +95,10 @@ def build_cell_bodies(workcell: Workcell, known: CellBodies | None = None) -> Ce
 
 
 def _compared(bodies: CellBodies) -> tuple[object, ...]:
-    """Return the pairs of bodies for which the cell's functions compute distances, and the number
-    of near ones.
+    """Return what decides which distances the cell's functions compute.
 
-    The near pairs come first.
+    Returns:
+        Indices of the possible pairs of bodies, near pairs first; and the number of near pairs.
     """
     return bodies.geometry.possible, bodies.geometry.near
 

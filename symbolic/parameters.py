@@ -330,7 +330,8 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
 def _grasp(
     take: _Take, group: str, path: str, cell: Workcell, commanded: int | None
 ) -> GraspNumbers:
-    """Return the constants of a grasp as parameters that are computed on first use.
+    """Return the constants of a grasp by pads with every array replaced by a placeholder or a
+    symbol. The numbers are computed when they are first needed.
 
     Args:
         take: replaces a parameter by a placeholder or a symbol.
@@ -364,12 +365,12 @@ def _grasp(
 
 
 def _as(kind: Any, record: Any, **changes: Any) -> Any:
-    """Return a record of another class with the same fields.
+    """Convert a record to another class that has the same fields and perhaps further ones.
 
     Args:
-        kind: the class.
-        record: record that gives the fields.
-        changes: fields with other values.
+        kind: the other class.
+        record: record whose values are taken.
+        changes: values of fields that differ from the record, or that the record lacks.
     """
     known = {each.name: getattr(record, each.name) for each in fields(record)}
     return kind(**(known | changes))
@@ -406,15 +407,16 @@ def _split(T: Array) -> tuple[Array, Array]:
 
 
 def _turn(take: _Take, group: str, path: str, rotation: Array) -> Any:
-    """Return the rotation of a robot's base with its parameters replaced.
+    """Return the rotation of a robot's base with its numbers replaced by placeholders or symbols.
 
-    These are cosine and sine of one angle for an upright base, all entries for a tilted base.
+    For an upright base the replaced numbers are cosine and sine of its angle about z. For a tilted
+    base they are all entries of the matrix.
 
     Args:
         take: replaces a parameter by a placeholder or a symbol.
         group: name of the parameter group.
         path: key path of the robot.
-        rotation: (3, 3) rotation of the base.
+        rotation: (3, 3) rotation of the base in the world.
     """
     level = np.array([0.0, 0.0, 1.0])
     if np.array_equal(rotation[2], level) and np.array_equal(rotation[:, 2], level):
@@ -516,10 +518,14 @@ def _base(take: _Take, path: str, base: ScreenBase) -> ScreenBase:
 
 @lru_cache(maxsize=512)
 def _collected_body(seen: CacheKey) -> tuple[Any, list[tuple[Parameter, Array | LazyParameter]]]:
-    """Collect the parameters of one body: its topology, and each parameter with its values.
+    """Collect the parameters of one body. The result is cached, because variants of a cell share
+    most bodies.
 
-    The result is cached, because variants of a cell share most bodies. `seen` holds the first part
-    of the parameters' key paths, and the body.
+    Args:
+        seen: cache key that holds the first part of the parameters' key paths, and the body.
+
+    Returns:
+        The body with placeholders for its parameters; and each parameter with its values.
     """
     take, (path, body) = _Collector(), seen.given
     return _body(take, path, body), take.entries.get(BODIES, [])
@@ -536,7 +542,8 @@ def _body(take: _Take, path: str, body: ScreenBody) -> Any:
 
 
 def _own(take: _Take, path: str, value: Any) -> Any:
-    """Return a record in which every array is replaced as a parameter, in the order of the fields.
+    """Return a record of a body in which every array is replaced by a placeholder or a symbol, in
+    the order of the fields.
 
     Args:
         take: replaces a parameter by a placeholder or a symbol.

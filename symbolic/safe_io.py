@@ -253,7 +253,7 @@ def _json_depth(document: str) -> int:
 
 
 def _depth(value: Any) -> int:
-    """Return the depth of nested tables and arrays, computed without recursion."""
+    """Return the depth of nested tables and arrays. It is computed without recursion."""
     level, layer = 0, [value]
     while layer:
         level += 1

@@ -246,11 +246,12 @@ def _robot_bodies(robot: Robot, i: int, links: ArmLinks, meshes: MeshReader) -> 
 def _standing_bodies(
     robots: tuple[Robot, Robot], i: int, links: tuple[ArmLinks, ArmLinks], meshes: MeshReader
 ) -> list[CollisionBody]:
-    """Return the links of a machine that do not move, as collision bodies.
+    """Return the links of an arm's machine that do not move, as collision bodies. There are none if
+    the description has no links beside the arm's.
 
     Args:
         robots: descriptions of both arms.
-        i: index of the arm whose machine it is.
+        i: index of the arm.
         links: for each arm the links that are modelled with it.
         meshes: reader of the meshes.
     """
@@ -269,17 +270,14 @@ def _standing_bodies(
 
 
 def _attachment(model: pin.Model, link: str, robot: Robot, i: int) -> tuple[Frame, Array]:
-    """Return the frame to which a link is fixed, the world or a joint's frame, and the link's pose
-    in it.
+    """Return the frame to which a link is fixed, and the link's pose (4, 4) in this frame. The
+    frame is that of a joint, or the world for a link that no joint moves.
 
     Args:
         model: Pinocchio's model of the arm.
         link: name of the link.
         robot: description of the robot.
         i: index of the arm.
-
-    Returns:
-        The frame, and the link's pose (4, 4) in it.
     """
     frame = model.frames[link_frame(model, link)]
     placement: Array = frame.placement.homogeneous
@@ -366,8 +364,8 @@ class MeshReader:
 
 
 def _state(path: Path) -> tuple[int, int]:
-    """Return a file's modification time and size; zeros if the file is missing, which reading it
-    reports later."""
+    """Return a file's modification time [ns] and size [bytes], zeros for a missing file. Whoever
+    reads the file reports that it is missing."""
     try:
         found = path.stat()
     except OSError:

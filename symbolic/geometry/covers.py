@@ -54,7 +54,8 @@ _DIRECTIONS = _directions()
 
 
 def slab_cover(body: CollisionBody) -> tuple[Piece, ...]:
-    """Return boxes, cylinders, spheres and capsules that together contain a body.
+    """Return a cover of a body: boxes, cylinders, spheres and capsules that together contain the
+    body.
 
     A simple shape is its own cover. A hull gets its smallest box among a few orientations. Pieces
     inside a box of the cover are dropped, and pieces that nearly fill a common box are merged.
@@ -124,8 +125,14 @@ def _often_close(seen: CacheKey) -> bool:
 
 @lru_cache(maxsize=4)
 def _steps(seen: CacheKey) -> list[Array]:
-    """Compute each joint's frame (OVERLAP_POSTURES, 4, 4) in the frame of the joint before it, at
-    random postures.
+    """Compute the pose of each joint's frame in the frame of the joint before it, at random
+    postures.
+
+    Args:
+        seen: cache key that holds the geometry of the arm.
+
+    Returns:
+        One array (OVERLAP_POSTURES, 4, 4) per joint.
     """
     (arm,), found = seen.given, []
     q = np.random.default_rng(0).uniform(arm.lower, arm.upper, (OVERLAP_POSTURES, arm.joints))
@@ -156,8 +163,8 @@ def _apart(first: tuple[Piece, ...], second: tuple[Piece, ...], T: Array) -> NDA
 
 
 def _covered(piece: Piece, cover: list[Piece]) -> bool:
-    """Return True if a piece is contained in the cover: as an element of it, or inside one box of
-    it."""
+    """Return True if a cover contains a piece because the piece is one of the cover's own pieces,
+    or lies inside one of its boxes."""
     return any(
         other is piece or (isinstance(other.shape, Box) and contains(other, piece))
         for other in cover
@@ -208,10 +215,10 @@ def _outermost(cover: list[Piece]) -> list[Piece]:
 
 
 def _merge_once(cover: list[Piece]) -> list[Piece] | None:
-    """Replace two pieces of a cover by their common box.
+    """Replace two pieces of a cover by the box around both.
 
-    Chosen are the pieces whose box stands out least from them. The result is None if every common
-    box stands out by more than `MERGE_SLACK`.
+    The chosen pair is the one whose box adds least to the pieces. The result is None if the boxes
+    of all pairs stand out from their pieces by more than `MERGE_SLACK`.
     """
     best: tuple[float, int, int, Piece] | None = None
     for i, j in combinations(range(len(cover)), 2):

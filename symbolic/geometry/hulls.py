@@ -98,9 +98,11 @@ def cut(mesh: trimesh.Trimesh, path: Path) -> CutMesh:
 
 
 def _may_be_cut(triangles: Array, filled: float) -> bool:
-    """Return True if `decompose` might cut a component with holes after its holes are closed.
+    """Return True if `decompose` might cut a component of a mesh after the holes in its surface are
+    closed.
 
-    False is certain: triangles that close a hole only enlarge the hulls of both halves of a cut.
+    If the result is False, `decompose` certainly does not cut: triangles that close a hole only
+    enlarge the hulls of both halves of a cut.
 
     Args:
         triangles: (n, 3, 3) corners of the component's triangles [m].
@@ -127,10 +129,11 @@ LARGE_PARTS = 24
 
 
 def _parts(mesh: trimesh.Trimesh) -> tuple[list[trimesh.Trimesh], list[NDArray[np.intp]]]:
-    """Split a mesh into components that become hulls of their own, and small other components.
+    """Split a mesh into its connected components, and separate small components if there are many.
 
     Returns:
-        The former as meshes; the others as arrays of face indices.
+        Components that become hulls of their own, as meshes; the other, small components, each as
+        an array of face indices.
     """
     nodes = np.arange(len(mesh.faces))
     parts = list(trimesh.graph.connected_components(mesh.face_adjacency, nodes=nodes, min_len=1))
@@ -145,10 +148,14 @@ def _parts(mesh: trimesh.Trimesh) -> tuple[list[trimesh.Trimesh], list[NDArray[n
 
 
 def _thickened(triangles: Array) -> Array:
-    """Return the corners (n, 6, 3) of a flat surface, moved both ways along every axis [m].
+    """Return the corners of a flat surface, each moved by `SMALLEST_SIZE` in both directions along
+    every axis, so that they span a volume.
 
     Args:
         triangles: corners of the surface's triangles, any shape (..., 3) [m].
+
+    Returns:
+        (n, 6, 3) six points for each of the n corners [m].
     """
     steps = SMALLEST_SIZE * np.concatenate([np.eye(3), -np.eye(3)])
     return np.asarray(triangles.reshape(-1, 1, 3) + steps, dtype=float)
@@ -370,10 +377,13 @@ class _Growth:
         return not _beyond(points, self.planes)
 
     def takes_in(self, points: Array) -> bool:
-        """Return True if a common hull may replace the hull and the convex hull of points (n, 3).
+        """Return True if one hull around both may replace the hull and another hull.
 
-        This holds if the stretched hull contains the points, or if all fit into a cube with the
-        edge `SMALL_PART`.
+        This holds if the stretched hull contains the other hull, or if both together fit into a
+        cube with the edge `SMALL_PART`.
+
+        Args:
+            points: (n, 3) corners of the other hull [m].
         """
         both = np.stack([points.min(axis=0), self.hull.vertices.min(axis=0)])
         high = np.maximum(points.max(axis=0), self.hull.vertices.max(axis=0))
@@ -387,8 +397,11 @@ class _Growth:
 
 
 def _beyond(points: Array, planes: Array) -> bool:
-    """Return True if any of the points (n, 3) [m] lies outside any of the planes (m, 4).
+    """Return True if any of several points lies on the outer side of any of several planes.
 
-    A plane is its outward unit normal and its offset [m].
+    Args:
+        points: (n, 3) points x [m].
+        planes: (m, 4) outward unit normal u (3,) and offset d [m] of each plane; u . x + d > 0
+            outside.
     """
     return bool(np.any(points @ planes[:, :3].T + planes[:, 3] > ROUNDOFF))

@@ -122,9 +122,8 @@ class CellGeometry:
 
     @cached_property
     def asked(self) -> tuple[str, ...]:
-        """Prefixes of the compiled functions to be evaluated: '', and `FAR` if a pair of it is
-        active.
-        """
+        """Prefixes of the names of the compiled functions to be evaluated: '' for the near pairs,
+        and `FAR` if any of the other pairs is active."""
         blocks = self.blocks.items()
         return tuple(b for b, pairs in blocks if not b or np.isin(self.columns, pairs).any())
 
@@ -204,8 +203,15 @@ def build_geometry(workcell: Workcell) -> CellGeometry:
 def _sorted_pairs(
     given: CacheKey,
 ) -> tuple[tuple[ActivePair, ...], tuple[ExcludedPair, ...], tuple[ActivePair, ...], int]:
-    """Return the active, excluded and possible pairs, and the number of near pairs
-    (`CellGeometry`).
+    """Sort all pairs of bodies.
+
+    Args:
+        given: cache key that holds the workcell, all bodies, both arms' geometry, and the reasons
+            of ignored pairs by the names of both bodies.
+
+    Returns:
+        Active pairs, excluded pairs, possible pairs with the near ones first, and the number of
+        near pairs, as in `CellGeometry`.
     """
     workcell, bodies, arms, ignored = given.given
     # Pairs within an arm are sorted as if its root were the world: where it stands does not matter.
@@ -245,13 +251,13 @@ def _sorted_pairs(
 
 @cache
 def _is_own(first: str, first_stands: bool, second: str, second_stands: bool) -> bool:
-    """Return True if only one arm has an influence on the distance of two bodies.
+    """Return True if the distance of two bodies depends on one arm only.
 
-    Both bodies belong to this arm, or one is the payload and the other is moved by the arm's
-    joints.
+    This holds if both bodies belong to this arm, or if one is the held payload and the joints of
+    the arm move the other.
 
     Args:
-        first, second: groups of the bodies.
+        first, second: groups of the bodies: 'robot 1', 'robot 2', 'payload' or 'environment'.
         first_stands, second_stands: whether the body is fixed to an arm's root.
     """
     groups = {first, second}
@@ -304,10 +310,8 @@ def _sorted(seen: CacheKey) -> _PairStatus:
 
 
 def _is_far(a: CollisionBody, b: CollisionBody) -> bool:
-    """Return True for a pair that few cells check.
-
-    One body is before an arm's second joint, and the other is neither of this arm nor the payload.
-    """
+    """Return True for a pair that few cells check: one body is an arm's link before the second
+    joint, and the other body is neither part of this arm nor the payload."""
     still = any(x.root is not None or (x.frame.joint == 0 and not x.is_tool) for x in (a, b))
     return still and a.group != b.group and "payload" not in (a.group, b.group)
 
@@ -350,9 +354,15 @@ def _check_tools(bodies: tuple[CollisionBody, ...], arms: tuple[ArmGeometry, Arm
 
 
 def _rigid(a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> str:
-    """Return the reason to exclude two bodies that do not move relative to each other; else ''.
+    """Return the reason to exclude a pair of bodies that do not move relative to each other; '' for
+    other pairs.
 
-    Both are fixed to one frame, or both are held together by the grasp of the arms.
+    Such bodies are fixed to one frame, or one is the box and the other the last link of an arm that
+    holds the box.
+
+    Args:
+        a, b: the two bodies.
+        arms: joints of both arms.
     """
     if a.frame != b.frame and "box" not in (a.frame.kind, b.frame.kind):
         return ""

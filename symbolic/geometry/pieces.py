@@ -132,7 +132,8 @@ def check_piece(piece: Piece, owner: str) -> None:
 
 
 def support(piece: Piece, directions: Array) -> Array:
-    """Compute the support function of a piece, max u.x over its points x [m]; exact.
+    """Compute how far a piece extends along directions u: the largest u . x of its points x [m],
+    exact.
 
     Args:
         piece: the piece.
@@ -146,7 +147,8 @@ def support(piece: Piece, directions: Array) -> Array:
 
 
 def reach(shape: ConvexShape, directions: Array) -> Array:
-    """Compute the support function of a shape, max u.x over its points x [m]; exact.
+    """Compute how far a shape extends along directions u: the largest u . x of its points x [m],
+    exact.
 
     Args:
         shape: the shape.

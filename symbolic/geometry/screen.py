@@ -219,7 +219,8 @@ def has_hulls(body: CollisionBody) -> bool:
 
 
 def _seen(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> CacheKey:
-    """Return the cache key of a body and the arm geometry on which its bounds depend."""
+    """Return the cache key of a body. It holds the body and both arms; keys are equal if the body
+    and the geometry of the arm that moves it are equal."""
     of: tuple[Any, ...] = (body.content,)
     if body.frame.kind == "link":
         of = (body.content, arms[body.frame.robot].chain)
@@ -307,8 +308,15 @@ def _obstacle(piece: Piece) -> Obstacle:
 
 
 def _extent(piece: Piece, A: Array) -> Array:
-    """Compute the least and largest coordinate [m] of a piece along each row of A (3, 3), as (2,
-    3)."""
+    """Compute the least and largest coordinate of a piece along three directions [m].
+
+    Args:
+        piece: the piece.
+        A: (3, 3) unit vectors of the directions as rows, in the body's frame.
+
+    Returns:
+        (2, 3) least coordinates, then largest coordinates.
+    """
     return np.stack([-support(piece, -A), support(piece, A)])
 
 
@@ -325,15 +333,18 @@ def _reach(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> Reach:
 
 
 def reach_about_joints(body: CollisionBody, arm: ArmGeometry) -> Array:
-    """Compute upper bounds (n,) of the distances of a link's points from each joint's axis [m].
+    """Compute for each joint of an arm an upper bound of the distance of a link's points from the
+    joint's axis [m].
 
-    The entry of a prismatic joint is 1. The entry of a joint that does not move the link is 0. For
-    the link's own joint the bound follows from the shape; for earlier joints the chain of links in
-    between is assumed stretched.
+    For the link's own joint the bound follows from the shape. For earlier joints the chain of links
+    in between is assumed stretched.
 
     Args:
         body: the link.
         arm: geometry of its arm with n joints.
+
+    Returns:
+        (n,) bounds; 1 for a prismatic joint, 0 for a joint that does not move the link.
     """
     reach = np.zeros(arm.joints)
     last = body.frame.joint
@@ -368,7 +379,7 @@ def _between(first: Array, second: Array) -> Array | None:
 
 
 def turned(rotation: Any) -> ca.SX:
-    """Return a rotation (3, 3), or the identity for None, as an expression."""
+    """Return a rotation (3, 3) as an expression; the identity if `rotation` is None."""
     return ca.SX.eye(3) if rotation is None else ca.SX(number(rotation))
 
 

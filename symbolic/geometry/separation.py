@@ -28,7 +28,8 @@ from symbolic.records.content import CacheKey
 
 
 def anchor(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry], robot: int) -> CollisionBody:
-    """Return the body, or, for the held box, a copy that is fixed to the last link of one arm.
+    """Return a body as seen by one arm. For the held box this is a copy that is fixed to the arm's
+    last link; any other body is returned unchanged.
 
     Args:
         body: the body.
@@ -101,15 +102,20 @@ def out_of_reach(
 
 
 def _gap(zone: Piece, pieces: tuple[Piece, ...]) -> float:
-    """Compute the distance [m] between a region `zone` and pieces in one frame; at most 0 if they
-    meet."""
+    """Compute the distance [m] between a region and several pieces; at most 0 if they meet.
+
+    Args:
+        zone: the region.
+        pieces: the pieces, in the frame of the region.
+    """
     if isinstance(zone.shape, Sphere):
         return min(_from_point(p, zone.centre) for p in pieces) - zone.shape.radius
     return coal_distance((zone,), pieces)
 
 
 def _from_point(piece: Piece, point: Array) -> float:
-    """Compute the distance [m] of a point (3,) from a piece in one frame; at most 0 inside."""
+    """Compute the distance [m] of a point (3,) from a piece; at most 0 if the point is inside.
+    Point and piece are in one frame."""
     x, y, z = ((point - piece.centre) @ piece.rotation).tolist()
     shape = piece.shape
     match shape:
@@ -137,9 +143,10 @@ def never_meet(
     """Return the reason to exclude two bodies that collide at no position of the two joints between
     them; '' for other pairs.
 
-    The farther body is replaced by the cylinder that it sweeps about the second joint's axis. The
-    range of the first joint is cut into intervals. An interval is free if the distance at its
-    middle exceeds the motion of the cylinder within half the interval by more than the tolerance.
+    The body behind the second joint is replaced by the cylinder that it sweeps about this joint's
+    axis. The range of the first joint is cut into intervals. An interval is free of collisions if
+    the distance at its middle, minus the largest motion of the cylinder within half the interval,
+    exceeds the tolerance.
 
     Args:
         a, b: the bodies.
@@ -179,11 +186,12 @@ def never_meet(
 
 
 def _zone(body: CollisionBody, arm: ArmGeometry, below: int) -> Piece:
-    """Return a region that contains a body at all positions of the joints between it and `below`.
+    """Return a region that contains a body of an arm at all positions of some of the arm's joints:
+    those after the joint `below`, up to the body's own.
 
-    If one turning joint is between them, the region is the cylinder that the body sweeps about the
-    joint's axis. Otherwise it is a ball about the first joint's origin, with the length of the
-    stretched links as radius.
+    If this is one turning joint, the region is the cylinder that the body sweeps about the joint's
+    axis. Otherwise it is a ball about the first of the joints, with the length of the stretched
+    links as radius.
 
     Args:
         body: a body of the arm.
@@ -202,8 +210,12 @@ def _zone_of(seen: CacheKey) -> Piece:
 
 @lru_cache(maxsize=256)
 def _zone_in_root(seen: CacheKey) -> Piece:
-    """Return the region of `_zone` in the frame of the arm's root, for a key that holds body, arm
-    and joint."""
+    """Return the region that `_zone` describes, in the frame of the joint `below`; for -1 in the
+    frame of the arm's root.
+
+    Args:
+        seen: cache key that holds the arguments of `_zone`: body, arm and below.
+    """
     body, arm, below = seen.given
     first = below + 1
     T = arm.origins[first]
@@ -213,11 +225,11 @@ def _zone_in_root(seen: CacheKey) -> Piece:
 
 
 def chain_radius(body: CollisionBody, arm: ArmGeometry, first: int) -> float:
-    """Return an upper bound of the distance of a link's points from the origin of an earlier joint
-    [m].
+    """Return an upper bound of the distance of a link's points from the origin of an earlier joint,
+    with the links in between stretched [m].
 
     Args:
-        body: a body of the arm.
+        body: the link.
         arm: joints of the arm.
         first: index of the earlier joint.
     """

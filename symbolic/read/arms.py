@@ -65,10 +65,10 @@ def chain_joints(urdf: Urdf, root: str, tip: str) -> tuple[str, ...]:
 
 
 def held_joints(urdf: Urdf, moving: Sequence[str], locked: Positions) -> Positions:
-    """Return every joint of a description that is held, with its position [rad or m].
+    """Return the joints of a description that do not move, each with its position [rad or m].
 
     The position is the one in `locked`, else zero or the limit closest to zero. The position of a
-    joint that mimics a held joint follows from that joint.
+    joint that mimics such a joint follows from it.
 
     Args:
         urdf: the description.
@@ -503,9 +503,9 @@ def _is_behind(urdf: Urdf, link: str, joints: Collection[str]) -> bool:
 
 
 def _carriers(robot: Robot) -> dict[str, str]:
-    """Return the name of the last arm joint before each link with shapes, by the link's name.
+    """Return for each link with shapes, by its name, the last arm joint before the link.
 
-    The name is 'universe' for a link that does not move.
+    It is a name, 'universe' for a link that does not move.
     """
     model = arm_model(robot)
     links = robot_urdf(robot).collisions
@@ -513,11 +513,12 @@ def _carriers(robot: Robot) -> dict[str, str]:
 
 
 def _mount(robot: Robot, still: Collection[str]) -> str:
-    """Return the link with shapes that an arm is mounted on; '' if there is none.
+    """Return the name of the link on which an arm is mounted: the last link before the flange that
+    the arm's own joints do not move and that has shapes; '' if there is none.
 
     Args:
         robot: the arm.
-        still: links that the arm's own joints do not move.
+        still: names of the links with shapes that the arm's own joints do not move.
     """
     urdf = robot_urdf(robot)
     way = (robot.flange, *(urdf.joints[name].parent for name in urdf.above(robot.flange)))

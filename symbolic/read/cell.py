@@ -338,7 +338,8 @@ def _owners(table: Any, path: str) -> Iterator[tuple[dict[str, Any], str]]:
 
 
 def _among(tables: list[dict[str, Any]], rest: str) -> Iterator[tuple[dict[str, Any], str]]:
-    """Yield the results of `_owners` for tables of an array.
+    """Yield the results of `_owners` for an array of tables, that is, the tables that contain a
+    key.
 
     Args:
         tables: the tables of the array.
@@ -356,7 +357,7 @@ def _among(tables: list[dict[str, Any]], rest: str) -> Iterator[tuple[dict[str, 
 
 
 def _plain(value: Any) -> Any:
-    """Convert a value, with NumPy arrays and numbers inside, to lists and numbers for TOML."""
+    """Convert a value that may contain NumPy arrays and numbers to lists and numbers for TOML."""
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):

@@ -309,8 +309,8 @@ def _expanded(
 
 
 def _answer(request: Any) -> Any:
-    """Send a request, a JSON value, to a process that expands xacro; return its answer, None after
-    a timeout."""
+    """Send a request to a new process that expands xacro, and return the answer. Both are JSON
+    values; the answer is None if the process exceeds its time or memory."""
     paths = [os.path.abspath(entry) for entry in sys.path]
     with tempfile.TemporaryFile() as answer:
         try:
@@ -338,7 +338,8 @@ def _answer(request: Any) -> Any:
 
 
 def _state(paths: Iterable[str]) -> Parts:
-    """Return each path with the digest of the file's content, empty for a missing file."""
+    """Return each path with the digest of the file's content; the digest is empty for a missing
+    file."""
     return tuple((path, _digest(path) if os.path.exists(path) else b"") for path in paths)
 
 

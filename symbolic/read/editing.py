@@ -44,10 +44,11 @@ def completed(text: str, data: Mapping[str, Any], changes: Changes) -> str:
 
 
 def with_paths(data: Mapping[str, Any], change: Callable[[str], str]) -> Changes:
-    """Return changes that replace the paths of robots, tools, environment and payload.
+    """Return changes of a workcell file that replace the paths of robots, tools, environment and
+    payload.
 
     Args:
-        data: the tables of a workcell file.
+        data: the tables of the workcell file.
         change: function from a path or a package address to its replacement.
     """
 
@@ -126,7 +127,7 @@ def _edited(
 
 
 def _alike(found: Any, wanted: Any) -> bool:
-    """Return True if two nested values, found and wanted, are equal, with NaN equal to NaN."""
+    """Return True if two nested values `found` and `wanted` are equal. Two NaN count as equal."""
     if isinstance(found, Mapping) and isinstance(wanted, Mapping):
         return found.keys() == wanted.keys() and all(_alike(found[k], wanted[k]) for k in found)
     if isinstance(found, list) and isinstance(wanted, list):

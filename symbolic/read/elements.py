@@ -113,9 +113,8 @@ class ElementReader:
         return f"{self.path} {key}".lstrip()
 
     def named(self, tag: str) -> dict[str, ElementReader]:
-        """Return the inner elements with a tag, by their names; record a problem for a repeated
-        name.
-        """
+        """Return the inner elements with a tag, by their names. A repeated name is recorded as a
+        problem."""
         found: dict[str, ElementReader] = {}
         for index, element in enumerate(self.element.findall(tag)):
             name = ElementReader(element, f"{self.path}/{tag}[{index}]".lstrip("/"), self.problems)
@@ -143,7 +142,7 @@ class ElementReader:
         return found
 
     def all(self, tag: str) -> list[ElementReader]:
-        """Return a reader of every inner element with a tag. These elements are not added to
+        """Return a reader of every inner element with a tag, without adding these elements to
         `kept`."""
         path = f"{self.path}/{tag}".removeprefix("/")
         return [

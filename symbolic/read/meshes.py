@@ -151,8 +151,8 @@ def _is_text(kind: str, content: bytes) -> bool:
 
 
 def _gaps(content: bytes) -> int:
-    """Compute an upper bound of the number of gaps between words. Bytes beyond ASCII may be
-    spaces."""
+    """Compute an upper bound of the number of gaps between the words of a text, which may contain
+    spaces beyond ASCII."""
     letters = np.frombuffer(content, np.uint8)
     return int(np.count_nonzero((letters <= 32) | (letters >= 128)))
 

@@ -250,13 +250,14 @@ def _on_surface(
     radius: float,
     half_sides: tuple[float, float] | None,
 ) -> Array:
-    """Compute the pose T_box_pad (4, 4) of a pad on a face of a box or cylinder.
+    """Compute the pose T_box_pad (4, 4) of a pad that lies on a face of a box or cylinder.
 
-    The result is the identity if the point is on no face, on an edge, or on a mesh.
+    If the point is on no face, on an edge, or on a mesh, a problem is recorded and the result is
+    the identity.
 
     Args:
-        table: the pad's table, for problems.
-        point: (3,) point in the box frame [m].
+        table: the pad's table, which collects problems.
+        point: (3,) centre of the pad in the box frame [m].
         spin: rotation of the pad about the normal [rad].
         payload: the payload.
         radius: radius of the patch [m].

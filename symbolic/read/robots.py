@@ -316,7 +316,13 @@ def _argument(value: str, folder: Path) -> str:
 
 @contextmanager
 def _recorded(table: TableReader, key: str) -> Iterator[None]:
-    """Record errors that are raised in the `with` block as problems of the key `key` in a table."""
+    """Convert errors that are raised in the `with` block to problems of the value at a key of a
+    table.
+
+    Args:
+        table: the table.
+        key: the key.
+    """
     try:
         yield
     except UrdfError as error:
@@ -389,9 +395,9 @@ def _read_described(
 
 
 def _read_chain(table: TableReader) -> tuple[str, str]:
-    """Read the names of the links at which the arm begins and ends.
+    """Read the names of the links at which the arm begins and ends: the key 'chain' or 'flange'.
 
-    The first name is '' if the file states the flange alone.
+    The first name is '' if the file states the flange only.
     """
     if not table.has("chain"):
         return "", table.text("flange")

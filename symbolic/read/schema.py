@@ -196,7 +196,8 @@ def _fields(record: type, *without: str) -> dict[str, Schema]:
 
 
 def _kind(kind: Any) -> Schema:
-    """Return the schema of an annotation that `symbolic.read.tables.checked` knows."""
+    """Return the JSON schema of a type annotation, one of those that `symbolic.read.tables.checked`
+    knows."""
     marks: tuple[Any, ...] = ()
     if get_origin(kind) is Annotated:
         kind, *marks = get_args(kind)  # type: ignore[assignment]

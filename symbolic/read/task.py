@@ -181,8 +181,8 @@ def _fixed(table: TableReader, key: str) -> Waypoint:
 
 
 def _waypoints(table: TableReader, names: Sequence[str]) -> list[Waypoint]:
-    """Read one entry of the waypoints: a fixed one, or `count` free ones with equal bounds. `names`
-    are the names of a pose's six numbers, for messages."""
+    """Read one table of `task.waypoints`: a fixed waypoint, or `count` free waypoints with equal
+    bounds. `names` are the names of a pose's six numbers, for messages."""
     if table.has("fixed"):
         pose = table.vector("fixed", quantity.POSE)
         table.refuse("fixed", ("lower", "upper", "count"))
@@ -378,9 +378,9 @@ def _choice(
 
 
 def _entry(entries: Sequence[RedundancyEntry], robot: Robot, name: str) -> RedundancyEntry:
-    """Return the entry of a robot's joint; an empty entry if the file has none.
+    """Return the table of `task.redundant` for a robot's joint; an empty one if the file has none.
 
-    An entry 'robot/joint' takes precedence over an entry with the joint's name alone.
+    The name 'robot/joint' takes precedence over the name of the joint alone.
     """
     by_name = {entry.joint: entry for entry in reversed(entries)}
     nothing = RedundancyEntry("", name)
@@ -477,15 +477,17 @@ class _Chain:
         self.middle = (self.low + self.high) / 2.0
 
     def jacobian(self, q: Array) -> Array:
-        """Compute the Jacobian (6, joints) of the flange, along the axes of the root."""
+        """Compute the Jacobian (6, joints) of the flange at joints q (n,): linear rows first, root
+        axes."""
         J: Array = pin.computeFrameJacobian(
             self.model, self.data, q, self.flange, pin.LOCAL_WORLD_ALIGNED
         )
         return J
 
     def error(self, q: Array, pose: Array) -> Array:
-        """Compute the error (6,) [m, rad] of the flange at joints q from its place for the box at
-        `pose` (6,)."""
+        """Compute the wanted minus the actual pose of the flange at joints q: position [m] and
+        rotation vector [rad], (6,), root axes. At the wanted pose the arm holds the box at `pose`
+        (6,)."""
         T = self.to_root @ box_placement(self.orientation, pose) @ self.T_box_flange
         pin.framesForwardKinematics(self.model, self.data, q)
         here = self.data.oMf[self.flange]
@@ -493,8 +495,8 @@ class _Chain:
         return np.concatenate([T[:3, 3] - here.translation, turn])
 
     def reach(self, q: Array, pose: Array) -> Array | None:
-        """Find joints (n,) near q that hold the box at a pose (6,) within the limits; None if not
-        found."""
+        """Find joint positions (n,) near q that are within the limits and hold the box at `pose`
+        (6,); None if Newton's method finds none."""
         for _ in range(MAX_NEWTON_STEPS):
             error = self.error(q, pose)
             if np.linalg.norm(error) < CLOSE and self.within(q):

@@ -331,7 +331,8 @@ def pose_of(part: ElementReader) -> Array:
 def _tree_problem(
     links: tuple[str, ...], joints: Mapping[str, UrdfJoint]
 ) -> tuple[str, str] | None:
-    """Return (element, text) if links and joints do not form a tree, else None."""
+    """Return why links and joints do not form a tree, as a pair of the wrong element and a text;
+    None if they do."""
     if not links:
         return "robot", "has no links; allowed is a tree of links and joints"
     moved_by: dict[str, str] = {}
@@ -369,7 +370,8 @@ def _tree_problem(
 
 
 def _mimic_problem(joints: Mapping[str, UrdfJoint]) -> tuple[str, str] | None:
-    """Return (element, text) if joints mimic each other in a circle, else None."""
+    """Return the problem if joints mimic each other in a circle, as a pair of the wrong element and
+    a text; None if they do not."""
     for name in joints:
         met, followed = {name}, joints[name].mimics
         while followed:

@@ -51,7 +51,8 @@ def digest_of_parts(value: Any, folder: Path = Path()) -> str:
 
 
 def _counted(part: bytes) -> bytes:
-    """Return bytes with their length in front, so that neighbouring parts cannot be confused."""
+    """Return bytes with their length in front, so that a sequence of such parts has one meaning
+    only."""
     return len(part).to_bytes(8, "big") + part
 
 
@@ -94,10 +95,11 @@ def _array_head(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
 
 @cache
 def _record(kind: Hashable) -> tuple[bytes, tuple[str, ...]]:
-    """Return what all records of a class have in common for their content.
+    """Return what the content of every record of a class has in common.
 
     Returns:
-        The bytes with which the content begins, and the names of the fields that belong to it.
+        The bytes with which the content begins, the counted class name; and the names of the fields
+        that belong to the content.
     """
     own: Any = kind
     names = (each.name for each in fields(own))

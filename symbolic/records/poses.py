@@ -155,7 +155,7 @@ def transform(rotation: ArrayLike, translation: ArrayLike) -> Array:
 
 def axes_with_z(axis: Array) -> Array:
     """Compute a rotation (3, 3) whose third column is the unit vector `axis` (3,). The other two
-    columns are any that complete it."""
+    columns are an arbitrary choice."""
     helper = np.eye(3)[int(np.argmin(np.abs(axis)))]
     x = np.cross(helper, axis)
     x /= np.linalg.norm(x)
