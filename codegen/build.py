@@ -84,11 +84,11 @@ class CSource:
 
     @classmethod
     def of(cls, name: str, function: ca.Function, lanes: int, level: int | None) -> CSource:
-        """Generate the C text of a CasADi function, under the name `name` in its set.
+        """Generate the C text of a CasADi function that is called `name` in its set.
 
-        The text evaluates `lanes` inputs side by side; a function without a form in lanes gets one
-        lane, with a warning. `level` is the compiler's optimisation level; for None the size
-        decides.
+        The text makes `lanes` evaluations side by side; a function that cannot be written for lanes
+        gets one lane, with a warning. `level` is the compiler's optimisation level; None to choose
+        by size.
         """
         from codegen.source import c_source, dense, generated_c, operations
 
@@ -315,7 +315,7 @@ def load_or_build(
 
 
 def _stored(tape: Tape, cache: Cache) -> StoredTape:
-    """Store a tape in the cache."""
+    """Store a tape in the cache, and return the entry."""
     signature = tape.signature.to_json()
     content = tape.instructions.tobytes().hex()
     key = key_of("tape", signature=signature, slots=tape.slots, content=content)
@@ -442,11 +442,9 @@ def _obtained(
     cache: Cache,
     load: Callable[[str, Cache], Member | None],
 ) -> dict[str, Member]:
-    """Load all libraries or tapes that the cache's record under `key` names, by name.
-
-    `load` loads one of them by its own key. If the record or one of them is missing, `make` makes
-    all, and the record is stored.
-    """
+    """Load all libraries or tapes of a set, by name. `key` is the key of the set's record in the
+    cache, and `load` loads one of them by its own key. If any is missing, `make` makes all of them,
+    and the record is stored."""
 
     def find() -> dict[str, Member] | None:
         record = cache.read_record(key)
@@ -489,7 +487,7 @@ def _compiled(
     """Compile sources in parallel, or take their libraries from the cache unless `rebuild`.
 
     Returns:
-        Pairs by the name of the source, library and True if the library was in the cache.
+        By the name of the source: the library, and True if it was in the cache.
     """
     compiler = compiler_of(cache)
     with ThreadPoolExecutor(available_cores()) as pool, interruptible():
@@ -512,10 +510,11 @@ def _compiled(
 def _begin(
     source: CSource, compiler: Compiler, cache: Cache, pool: ThreadPoolExecutor, rebuild: bool
 ) -> Future[tuple[Library, bool]]:
-    """Start to compile a source in the pool's threads; give its library, and True if it was cached.
+    """Start to compile a source in the threads of `pool`, or take its library from the cache unless
+    `rebuild`. The future has the library, and True if it was cached.
 
-    If `rebuild`, the source is compiled even if it is cached. The pool starts work in order, so the
-    object files of separate functions are begun before the library that links them.
+    The pool starts work in order, so the object files of functions that are compiled separately are
+    begun before the library that links them.
     """
     flags = () if source.lanes == 1 else LANE_FLAGS
     rest, parts = in_parts(source.text, source.lanes, source.most)

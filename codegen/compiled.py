@@ -128,7 +128,10 @@ class CompiledFunction(NumericFunction):
             future.result()
 
     def _require_one_value(self, batched: Sequence[bool]) -> None:
-        """Check that inputs with one value for all lanes have no value per evaluation.
+        """Check that no input that is shared by all lanes is given with one value per evaluation.
+
+        Args:
+            batched: for each input, True if it is given with one value per evaluation.
 
         Raises:
             CodegenError: such an input has one value per evaluation.
@@ -155,10 +158,11 @@ class CompiledFunction(NumericFunction):
         return run, lambda: self._native(begin_of_ports)
 
     def _native(self, of_batch: int) -> NativeCall:
-        """Return the addresses with which C evaluates a batch, with work memory of this thread.
+        """Return the addresses with which C code evaluates a batch: the compiled functions, the
+        batch and work memory of this thread.
 
         Args:
-            of_batch: address of the descriptions of arguments and results (`ports`).
+            of_batch: address of the descriptions of arguments and results, from `ports`.
         """
         lanes = self._in_lanes if self.lanes > 1 else None
         own = [0, 0] if lanes is None else [lanes.address, lanes.own.address]
@@ -251,8 +255,11 @@ _warned = False
 
 
 def cannot_load(name: str, error: Exception) -> CodegenError:
-    """Build the error, with the remedy, for the cached library of the function `name`, which
-    `error` kept from being loaded.
+    """Return an error that says that a cached library cannot be loaded, and what to do.
+
+    Args:
+        name: name of the compiled function.
+        error: the error that was raised when the library was loaded.
     """
     return CodegenError(
         f"{name}: the compiled library cannot be loaded: {error}; if its folder does not allow "
@@ -262,8 +269,11 @@ def cannot_load(name: str, error: Exception) -> CodegenError:
 
 
 def warn_one_lane(name: str, reason: str) -> None:
-    """Warn once per process that the function `name` runs one evaluation at a time, for a
-    `reason`.
+    """Warn, once per process, that a function is evaluated one input at a time instead of in lanes.
+
+    Args:
+        name: name of the function.
+        reason: why it has no lanes.
     """
     global _warned
     if _warned:

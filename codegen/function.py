@@ -277,7 +277,7 @@ class NumericFunction(ABC):
 
         Returns:
             A function that evaluates the first k items of the batch, given k; and a function that
-            returns the addresses for C, or None if C cannot evaluate the batch.
+            returns the addresses with which C code evaluates the batch, or None if C cannot.
         """
 
         def run(count: int) -> None:
@@ -376,20 +376,22 @@ class PreparedBatch:
         run: Callable[[int], None],
         native: Callable[[], NativeCall] | None = None,
     ) -> None:
-        """Store the arrays and the function that evaluates them.
+        """Store the arrays and the functions that evaluate them.
 
         Args:
             inputs, outputs: arrays by name.
             size: largest number of evaluations.
-            run: function that evaluates the first items, given their number.
-            native: function that returns addresses for C; None if C cannot evaluate the function.
+            run: function that evaluates the first items of the batch, given their number.
+            native: function that returns the addresses with which C code evaluates the batch; None
+                if C cannot evaluate the function.
         """
         self.inputs, self.outputs, self.size, self._run = inputs, outputs, size, run
         self._native = native
 
     @property
     def native(self) -> NativeCall | None:
-        """Addresses for C in the calling thread; None for interpreted functions."""
+        """Addresses with which C code evaluates the batch in the calling thread; None for
+        interpreted functions."""
         return None if self._native is None else self._native()
 
     def __call__(self, count: int | None = None) -> dict[str, Array]:
@@ -416,10 +418,10 @@ def ports(
     batched: Sequence[bool],
     outputs: Sequence[NDArray[Any]],
 ) -> ctypes.Array[ctypes.c_longlong]:
-    """Return the addresses of the arguments and results of a batch, as drivers in C take them.
+    """Return the description of a batch that drivers in C take (`codegen/c/driver.c`).
 
-    For each array this is its address and the step from one evaluation to the next, in numbers
-    (`codegen/c/driver.c`).
+    It has two integers per array, inputs first: the address of the array, and the step from one
+    evaluation to the next, counted in entries; 0 for an input with one value for all.
 
     Args:
         signature: signature of the function.

@@ -37,7 +37,7 @@ class InterpretedFunction(NumericFunction):
     """
 
     def __init__(self, function: ca.Function) -> None:
-        """Make sparse inputs and outputs dense."""
+        """Store a CasADi function, with sparse inputs and outputs made dense."""
         super().__init__(Signature.of(function))
         self.function = dense(function)
 
@@ -161,19 +161,21 @@ def compare(
 
 
 def directional_derivative(function: ca.Function) -> ca.Function:
-    """Build the directional derivative of a function (CasADi's forward mode).
+    """Build the function of the derivatives of a function's outputs along a direction (CasADi's
+    forward mode).
 
-    Its inputs are the function's inputs, its outputs at these inputs, and a direction with the
-    shapes of the inputs. Its outputs are the derivatives of the outputs along this direction.
+    Inputs: the function's inputs; its outputs at these inputs; the direction, one array per input,
+    of the input's shape. Outputs: the derivative of each output along the direction.
     """
     return dense(function).forward(1)
 
 
 def relative_difference(reference: Array, other: Array) -> float:
-    """Compute the largest difference of two arrays, relative to the largest entry of `reference`.
+    """Compute the largest difference of two arrays over the largest entry of the array `reference`.
 
-    This is max abs(reference - other) over max abs(reference), both over the finite entries; the
-    divisor is at least `RESIDUE`. The result is infinite if the NaN or infinite entries differ.
+    This is max abs(reference - other) / max abs(reference), both over the finite entries; the
+    divisor is at least `RESIDUE`. The result is infinite if NaN or infinite entries of one array
+    are not equal in the other.
     """
     finite = np.isfinite(reference)
     if not np.array_equal(reference[~finite], other[~finite], equal_nan=True):

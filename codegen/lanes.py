@@ -131,8 +131,8 @@ def lane_text(generated: str, prefix: str, shared: Collection[int] = ()) -> Lane
     Args:
         generated: CasADi's text, with CasADi's comments.
         prefix: prefix of all defined names.
-        shared: indices of arguments of a straight function that are passed as plain numbers, equal
-            for all lanes.
+        shared: indices of arguments that are passed as plain numbers, equal for all lanes; only for
+            a function without nested calls.
 
     Raises:
         FormError: a line cannot be translated to lanes.
@@ -175,9 +175,16 @@ def _lines(function: re.Match[str], shared: Collection[int] = ()) -> str:
 
 
 def _choice(function: re.Match[str]) -> str | None:
-    """Translate the C of `casadi.Function.if_else` to lanes; None for another function.
+    """Translate the C of a choice between two functions (`casadi.Function.if_else`) to lanes.
 
-    Each branch runs if a lane needs it, and a mask selects the lanes that keep its results.
+    Each branch runs if at least one lane needs it, and a mask selects the lanes that keep its
+    results.
+
+    Args:
+        function: the function in CasADi's text, with the groups 'body' and 'outputs'.
+
+    Returns:
+        The body in lanes; None if the function is no such choice.
     """
     branches = _CHOICE.match(function["body"])
     if branches is None or function["outputs"] is None:
@@ -204,8 +211,8 @@ def _choice(function: re.Match[str]) -> str | None:
 
 
 def _size(described: str) -> int:
-    """Return the number of entries of a result from CasADi's comment: name, name[3] or
-    name[3x4]."""
+    """Return the number of entries of a result from its description in CasADi's comment: name,
+    name[3] or name[3x4]."""
     shape = re.search(r"\[(\d+)(?:x(\d+))?\]", described)
     return prod(int(length) for length in shape.groups(default="1")) if shape else 1
 

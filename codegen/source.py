@@ -115,19 +115,25 @@ def program_source(functions: Mapping[str, ca.Function], own: str, lanes: int = 
 
 
 def _lanes_header(lanes: int) -> list[str]:
-    """Return pieces of C text that define the types of lanes; for `lanes` = 0 with the machine's
-    width.
+    """Return pieces of C text that define the types of lanes.
+
+    Args:
+        lanes: number of lanes; 0 for the width of the machine that compiles.
     """
     width = f"#define DUAL_ARM_LANES {lanes}\n" if lanes else ""
     return [runtime("one_lane.h"), width, runtime("lanes.h")]
 
 
 def _lane_functions(functions: Mapping[str, ca.Function]) -> Iterator[str]:
-    """Yield the C of functions in lanes, each as `NAME(arg, res, iw, w)` over `lanes_real`.
+    """Yield the C text of functions in lanes. Each is called as `NAME(arg, res, iw, w)`, with
+    CasADi's arguments, results and work memory, as arrays of `lanes_real`.
 
     Macros state the sizes of the work memory (NAME_ARG, NAME_RES, NAME_IW, NAME_W) and of result k
     (NAME_OUT_k). NAME_SHARED is 1 if arguments named with `SHARED_SUFFIX` are passed as plain
     numbers, else 0.
+
+    Args:
+        functions: the CasADi functions by name.
     """
     for name, function in functions.items():
         whole = dense(function)
@@ -198,8 +204,8 @@ def _filled(driver: str, signature: Signature, generated: str = "") -> str:
 def operations(function: ca.Function, left_out: frozenset[str] = frozenset()) -> int:
     """Count the instructions that one evaluation of a CasADi function runs.
 
-    Nested calls count with all their instructions, as often as they run. Both branches of a choice
-    count. An instruction on a whole vector counts once.
+    Nested calls count with all their instructions, as often as they run. An `if_else` counts with
+    both branches. An instruction on a whole vector counts once.
 
     Args:
         function: the function.

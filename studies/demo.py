@@ -102,8 +102,8 @@ def first_result(evaluations: int = QUICK_EVALUATIONS, seed: int = 1) -> Iterato
 
 
 def _held(timing: ho.Timing) -> str:
-    """Return the names of the limits that a timed carry uses fully, friction left out; if the
-    timing failed, the reason."""
+    """Return the names of the limits that a timed carry uses fully, except friction. If the timing
+    failed, return the reason."""
     if not timing.ok:
         return timing.reason
     # The least forces always use the whole friction.

@@ -130,7 +130,8 @@ def _require_file(path: Path, kind: str = "") -> None:
 
 
 def _expected(path: Path, kind: str) -> str:
-    """Return the end of a message: the expected kind of file and where such files usually are.
+    """Return the end of a message about an unsuitable path: the expected kind of file, and a file
+    that the user may have meant.
 
     Args:
         path: the unsuitable path.
@@ -313,7 +314,7 @@ def add(parser: argparse._ActionsContainer, *names: str, **own: Any) -> None:
     Args:
         parser: parser of the program.
         names: names in the table of options; positional arguments in capitals.
-        own: attributes of the options, as for `add_argument`, that differ in this program.
+        own: arguments of `add_argument`, such as `help`, that replace those of the table.
     """
     for name in names:
         place = {} if name.startswith("-") else {"metavar": name}
@@ -400,7 +401,12 @@ def _statements(path: Path) -> dict[str, ast.AST]:
 
 
 def _named(body: list[ast.stmt]) -> dict[str, ast.AST]:
-    """Return the syntax trees of the classes and values of a source, by name."""
+    """Return the syntax trees of the classes and of the assigned values in a source, by the name of
+    the class or variable.
+
+    Args:
+        body: statements of the source.
+    """
     found: dict[str, ast.AST] = {}
     for node in body:
         if isinstance(node, ast.ClassDef):

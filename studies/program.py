@@ -245,9 +245,12 @@ class Program:
 
 
 def _done(name: str, options: argparse.Namespace) -> int:
-    """Import a function by its dotted name, call it with the parsed options, return its exit code.
+    """Call a function with the parsed options of a program, and return its exit code. Numerical
+    libraries run in one thread meanwhile.
 
-    Numerical libraries run in one thread meanwhile.
+    Args:
+        name: module and name of the function, such as 'studies.demo.show'.
+        options: the parsed options.
     """
     from hybrid_opt.workers import one_thread
 

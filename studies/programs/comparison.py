@@ -222,7 +222,7 @@ def as_text(found: CampaignComparison) -> str:
 
 
 def _quantity(figure: str) -> tuple[str, Quantity]:
-    """Return a figure's name for people, and the format of its values."""
+    """Return the name of a figure as people read it, and the quantity that formats its values."""
     quantity = REPLICA_QUANTITIES[figure.removeprefix(POLISHED_PREFIX)]
     of = "polished, " if figure.startswith(POLISHED_PREFIX) else ""
     return f"{of}{quantity.heading()}", quantity

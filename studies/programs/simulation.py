@@ -295,11 +295,12 @@ def _tell_sweep(step: float, threshold: Threshold[AnyOutcome]) -> None:
 def _tell_worst(
     pressed: Callable[[float], Outcome], planned: Callable[[], Outcome], workcell: Workcell
 ) -> None:
-    """Simulate a carry with the worst friction of the uncertainty and print whether the box holds.
+    """Print whether the box holds with the worst friction of the uncertainty, with the commanded
+    and with the planned forces.
 
     Args:
-        pressed: simulation with the commanded forces, given a factor of these.
-        planned: simulation with the planned forces.
+        pressed: function that simulates the carry with the commanded forces times its argument.
+        planned: function that simulates the carry with the planned forces.
         workcell: the cell, with its uncertainty.
     """
     tracked = 1.0 - workcell.uncertainty.tracking
@@ -313,10 +314,11 @@ def _tell_worst(
 
 
 def threshold_text(threshold: Threshold[AnyOutcome], slip: float) -> str:
-    """Format in one line the factors of the planned force just below and above the threshold, and
-    where and when the box slips.
+    """Format a result of the search for the least force in one line: the factors of the planned
+    force just below and above the threshold, and where and when the box slips.
 
     Args:
+        threshold: simulations just below and just above the threshold.
         slip: displacement that counts as slip [m].
     """
     slips, holds = threshold.slips, threshold.holds
@@ -328,8 +330,8 @@ def threshold_text(threshold: Threshold[AnyOutcome], slip: float) -> str:
 
 
 def _moment(time: float) -> str:
-    """Format a time [s] from the beginning of the carry. Negative times, while the pads press
-    before it, are named as such."""
+    """Format a time from the beginning of the carry [s]. A negative time belongs to the pressing
+    before the carry, and the text says so."""
     return f"{-time:.3f} s before the carry" if time < 0.0 else f"at {time:.3f} s"
 
 

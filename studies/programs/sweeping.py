@@ -104,8 +104,8 @@ def _table(done: Sweep, longest: int = sys.maxsize) -> Table:
 
 
 def _figure(done: Sweep) -> Figure:
-    """Draw duration and force of a sweep's carries over the values of the last key, one line per
-    combination of the other keys' values."""
+    """Draw the duration and the force of a sweep's carries, in two panels, over the values of the
+    last swept key. Each combination of the other keys' values has a line."""
     figure = new_figure(0.45)
     panels = figure.subplots(1, 2)
     *outer, last = done.over

@@ -212,6 +212,7 @@ def _report(job: Job, stiffness: float | None) -> str:
     and warnings.
 
     Args:
+        job: the job.
         stiffness: stiffness of each arm at its pad along the normal [N/m]; None if unknown.
     """
     parts = [repr(job)]
@@ -280,10 +281,11 @@ def _robust_forces(cell: Cell, x: Array, options: argparse.Namespace) -> int:
 def _priced(model: RobustModel, carry: Carry, options: argparse.Namespace) -> int:
     """Print how much a carry's normal forces grow with the uncertainty. Return the exit code.
 
-    The forces are computed for multiples of the uncertainty, and tested in random cases.
+    The forces are computed for several multiples of the uncertainty, and tested in random cases of
+    the uncertainty.
 
     Args:
-        model: model of the forces in all cases of the uncertainty.
+        model: model that computes robust forces.
         carry: the carry.
         options: parsed command line.
     """
@@ -315,8 +317,8 @@ def _priced(model: RobustModel, carry: Carry, options: argparse.Namespace) -> in
 
 
 def _timed(cell: Cell, x: Array, limit: float) -> list[str]:
-    """Time a path as fast as possible within a force limit: once with planned forces, once with
-    those that hold in every case of the uncertainty. Return a line of text for each.
+    """Time a path as fast as possible within a force limit. Return two lines of text with the
+    durations: with planned forces, then with robust forces.
 
     Args:
         cell: the cell.

@@ -133,8 +133,8 @@ class Experiment:
 
     @property
     def force_kind(self) -> ForceKind:
-        """Kind of the normal forces, planned or robust, that the force limits and objectives of the
-        experiment mean."""
+        """Kind of the normal forces in the experiment's objectives and force limits: planned or
+        robust."""
         return force_kind(self.objectives)
 
     @property
@@ -151,7 +151,9 @@ class Experiment:
         """Yield the fronts of each algorithm's representative replica, then the polished union if
         there is one.
 
-        Each comes with its line style, and with True if a polished front replaces it.
+        Yields:
+            Line style, front, and True if the experiment has a polished front that replaces this
+            one.
         """
         for algorithm in self.solved:
             found = algorithm.shown.fronts
@@ -161,8 +163,14 @@ class Experiment:
             yield series(len(self.algorithms)), self.union, False
 
     def driven(self, objectives: Array) -> Array:
-        """Convert objectives (k, 2) of a drivable experiment, scaled duration and force, to force
-        [N] and duration [s] (k, 2)."""
+        """Convert objectives of a drivable experiment to physical units.
+
+        Args:
+            objectives: (k, 2) duration and force as the search scales them.
+
+        Returns:
+            (k, 2) force [N] and duration [s].
+        """
         reference = float(self.workcell.task.reference_force.max())
         return objectives[:, ::-1] * [reference, duration_unit(self.workcell)]
 
@@ -248,8 +256,8 @@ class ReportData(Experiment):
 def gather(
     results: CampaignResults, workers: Workers | None = None, paper: bool = True
 ) -> ReportData:
-    """Collect the data of a report: read the results of a study, evaluate the carries to draw, and
-    plan the jobs around the recommended and the hand-made one.
+    """Read the results of a study, evaluate the carries that the report draws, and plan the jobs
+    around the recommended and the hand-made carry.
 
     Args:
         results: folder of the finished study.

@@ -273,7 +273,7 @@ class DrawnCarry:
 
     @cached_property
     def sensitivity(self) -> PayloadSensitivity:
-        """Contact forces of the same motion for other masses of the payload."""
+        """Contact forces of the carry's motion for other masses of the payload."""
         # Not imported at the top: pictures of a cell need no timing.
         from hybrid_opt.timing.robustness import payload_sensitivity
 
@@ -486,8 +486,14 @@ def draw_cell(
 
 
 def _polygons(flat: Array, **style: Any) -> PolyCollection:
-    """Return a Matplotlib collection of polygons flat (n, k, 2). One array is faster than a list,
-    but unknown to Matplotlib's type stubs."""
+    """Return n polygons with k corners each as a Matplotlib collection.
+
+    One array is faster than a list of polygons, but unknown to Matplotlib's type stubs.
+
+    Args:
+        flat: (n, k, 2) corners in picture coordinates [m].
+        style: keyword arguments of Matplotlib for the polygons.
+    """
     return PolyCollection(flat, **style)  # type: ignore[arg-type]
 
 

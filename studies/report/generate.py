@@ -69,13 +69,13 @@ class ReportPicture:
 
 
 def _of(name: str, draw: Callable[..., Figure], *given: Any, caption: str = "") -> ReportPicture:
-    """Return a picture that a function draws from given arguments.
+    """Return a picture of the report that is not drawn yet.
 
     Args:
         name: name of the picture's files, without suffix.
         draw: function that draws the figure.
-        caption: caption of the picture; '' for the docstring of `draw` without the word 'Draw'.
         given: arguments of `draw`.
+        caption: caption of the picture; '' for the docstring of `draw` without the word 'Draw'.
     """
     text = " ".join((caption or inspect.getdoc(draw) or "").removeprefix("Draw ").split())
     return ReportPicture(name, text[:1].upper() + text[1:], partial(draw, *given))
@@ -327,6 +327,7 @@ def _block(text: str, attributes: str = "") -> str:
     Equal texts give equal elements.
 
     Args:
+        text: the text.
         attributes: further attributes of the element.
     """
     content = base64.b64encode(gzip.compress(text.encode(), 9, mtime=0)).decode()
@@ -383,7 +384,7 @@ def _facts(data: ReportData) -> str:
 
 
 def _assumed(data: ReportData) -> str:
-    """Return a sentence or two on the kind of contact that the forces of each experiment assume."""
+    """Return one sentence per experiment on the kind of contact that its forces assume."""
     said = f"The forces of this experiment are of {contact_model(data.workcell).assumption}."
     if data.drivable is None:
         return said

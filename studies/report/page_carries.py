@@ -75,8 +75,8 @@ def recommended_job(x: Array, cells: Sequence[ReadyCell]) -> DrawnJob:
     """Plan the job around the recommended carry as robots drive it.
 
     Args:
-        x: (n_var,) decision vector of the carry.
-        cells: cells of the report; the last one is the cell in which the carry was found.
+        x: (n_var,) decision vector of the carry, in the last cell.
+        cells: cells of the report; robots drive in the last one.
     """
     model = cells[-1].jobs
     found = drawn(model, RECOMMENDED_LABEL, lambda: driven_timing(model.timing, x), True)
@@ -277,12 +277,12 @@ class PageTrajectory:
 
 
 def _with_job(trajectory: dict[str, Any], found: DrawnJob) -> None:
-    """Add a job to the JSON values of a trajectory as a further motion; or the reason why there is
-    none.
+    """Add a job to the JSON values of a trajectory, as a further entry of its list 'motions'. If
+    there is no job, add the reason as 'jobProblem'.
 
     Args:
-        trajectory: the values, which are changed.
-        found: the job, or the reason.
+        trajectory: JSON values from `page_trajectory`, which are changed.
+        found: the job, or the reason why there is none.
     """
     job, motions = found.job, trajectory["motions"]
     if job is None:
@@ -431,16 +431,16 @@ def _motion(name: str, carry: ho.Carry, commanded: Array | None = None) -> dict[
 def _uses(
     workcell: Workcell, whole: Array, contact: Sequence[Array]
 ) -> dict[str, list[float | None]]:
-    """Return how much of its torque limit each joint uses at most [%]; None for joints without a
-    limit.
-
-    The lists have one entry per joint. The key `torqueUse` is for all loads, `contactTorqueUse` for
-    the contact wrenches alone.
+    """Return the largest share of its torque limit that each joint uses [%].
 
     Args:
         workcell: the cell.
         whole: (n, joints) torques of all loads [N m].
         contact: arrays (n, joints) of torques of the contact wrenches, one per phase [N m].
+
+    Returns:
+        Two lists with one share per joint, None for a joint without limit: `torqueUse` for all
+        loads, `contactTorqueUse` for the contact wrenches alone.
     """
     torques = {"torqueUse": whole, "contactTorqueUse": np.concatenate(contact)}
     return {name: _rounded(joint_torque_use(workcell, each), 3) for name, each in torques.items()}
@@ -462,13 +462,15 @@ def joint_torque_use(workcell: Workcell, torque: Array) -> Array:
 
 
 def _values(cell: ho.Cell, judged: ho.Carry, found: dict[str, Any]) -> str:
-    """Return the text in the title of a trajectory: duration and commanded force; without a
-    commanded force planned forces, or else the objectives.
+    """Return the figures in the title of a trajectory as text.
+
+    These are duration and commanded force. A carry without a commanded force has duration and
+    planned force if its cell is drivable, otherwise planned forces or objectives.
 
     Args:
         cell: the cell of the trajectory.
         judged: the evaluated carry.
-        found: JSON values of the trajectory.
+        found: JSON values of the trajectory with the keys 'duration', 'commanded' and 'planned'.
     """
     if found["commanded"] is not None:
         order = contact_model(cell.workcell).order
@@ -487,12 +489,12 @@ def _values(cell: ho.Cell, judged: ho.Carry, found: dict[str, Any]) -> str:
 
 
 def _samples(carry: ho.Carry, commanded: Array | None) -> Array:
-    """Return samples of a carry for the page, with the columns of `job_samples`.
+    """Return samples of a carry for the page, with the columns that `job_samples` describes.
 
     Args:
         carry: the carry at n samples.
-        commanded: (n, 2) commanded normal force of each arm [N]; None for the planned ones, with
-            NaN in the last two columns.
+        commanded: (n, 2) commanded normal force of each arm [N]. If None, the planned forces take
+            their place, and the last two columns are NaN.
 
     Returns:
         (k, 11 + joints) samples.

@@ -226,8 +226,9 @@ def drive_look(points: Array, always: Array, allowed: float) -> Array:
 def carry_plots(workcell: Workcell) -> dict[str, Plot]:
     """Return the plotly plots of one trajectory by the ids of their HTML elements, without data.
 
-    The entry `meta` of a trace says which data the page's script inserts: a column of the samples,
-    a constant, or the joints of one arm. It also has the name of the trace for planned forces.
+    The value `meta` of each trace says which data the page's script inserts: a column of the
+    samples, a constant level, or the joint torques of one arm. For a trace of commanded forces it
+    also has the name that the trace takes if the page shows planned forces.
     """
     joints, arm = [len(robot.torque_max) for robot in workcell.robots], 1 - LEADER
     force, robot = 7 + sum(joints), plain(workcell.robots[arm].name)
@@ -438,11 +439,11 @@ def _search_groups(data: ReportData, paper: bool) -> Iterator[MeshGroup]:
 
 
 def _traces(groups: Sequence[Numbered], found: Sequence[dict[str, Any]]) -> Iterator[Plot]:
-    """Yield a plotly trace for each group that has a marker.
+    """Yield a plotly trace for each group of trajectories that has a marker.
 
     Args:
-        groups: groups of trajectories with their numbers on the page.
-        found: JSON values of all trajectories of the page.
+        groups: pairs of a group and the numbers of its trajectories on the page.
+        found: JSON values of all trajectories of the page, by number.
     """
     for group, members in groups:
         if group.look is None:
@@ -477,8 +478,8 @@ def _drive_view(
     Args:
         data: what the report shows.
         drivable: the drivable experiment.
-        groups: groups of trajectories with their numbers.
-        found: trajectories of the page as JSON values, by number.
+        groups: pairs of a group and the numbers of its trajectories on the page.
+        found: JSON values of all trajectories of the page, by number.
     """
     allowed = float(drivable.workcell.task.reference_force[1 - LEADER])
     # The recommended carry is drawn last, above all others.
@@ -515,8 +516,8 @@ def _search_view(
 
     Args:
         data: what the report shows.
-        groups: groups of trajectories with their numbers.
-        found: trajectories of the page as JSON values, by number.
+        groups: pairs of a group and the numbers of its trajectories on the page.
+        found: JSON values of all trajectories of the page, by number.
     """
     titles = [*data.objective_titles, "", ""]
     judged = [carry.timed.judgement for carry in data.carries]

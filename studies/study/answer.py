@@ -230,9 +230,15 @@ def _rival(rival: Alternative, found: StoredRecommendation) -> str:
 
 
 def _checked(price: RobustPrice) -> str:
-    """Return a phrase on robustness: how many random cases slip, the uncertainty, the leading arm's
-    largest force, and the largest multiple of the uncertainty that the reference forces would
-    hold."""
+    """Return a phrase on the robustness of the recommended carry.
+
+    It says how many random cases of the uncertainty slip, which uncertainty this is, the largest
+    force of the leading arm, and which multiple of the uncertainty the reference forces would still
+    hold.
+
+    Args:
+        price: robust forces of the carry, by multiple of the uncertainty.
+    """
     slips = "slips" if price.check.failing == 1 else "slip"
     return (
         f"{price.check.failing or 'none'} of {price.check.cases} random cases {slips} "
@@ -246,11 +252,8 @@ def _percent(ratio: float) -> str:
 
 
 def _margins(found: StoredRecommendation) -> list[str]:
-    """Return phrases on the errors at which the commanded force becomes too small.
-
-    These are the part of this force that may be missing, and the error of the centre of mass along
-    each axis.
-    """
+    """Return phrases that say how far the description may be off until the commanded force is too
+    small: the missing share of this force, and the error of the centre of mass along each axis."""
     texts = [
         f"up to {100.0 * margin.limit:.0f} % of it may be missing"
         for margin in found.margins

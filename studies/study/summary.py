@@ -383,9 +383,12 @@ def replica_figures(
 
 
 def best_steps(history: Array) -> tuple[Array, ...]:
-    """Return a row for every evaluation that changed the best value of an objective: its number
-    from 1, then the best value of each objective. `history` (n, n_obj) holds the best values after
-    every evaluation, NaN before the first feasible candidate."""
+    """Return one row for every evaluation that changed the best value of an objective: its number,
+    from 1, then the best value of each objective.
+
+    Args:
+        history: (n, n_obj) best values after every evaluation, NaN before the first feasible one.
+    """
     known = history[~np.isnan(history).any(axis=1)]
     first = len(history) - len(known)
     changes = np.flatnonzero((np.diff(known, axis=0) != 0.0).any(axis=1)) + 1

@@ -144,7 +144,7 @@ def _variants(name: str, entry: AlgorithmFigures) -> list[tuple[str, list[FrontF
         entry: figures of the algorithm.
 
     Returns:
-        For each row a label and the figures of all replicas.
+        For each row its label, and the figures of the front of each replica.
     """
     found: list[tuple[str, list[FrontFigures]]] = [(title(name), list(entry.replicas))]
     polished = [row.polished for row in entry.replicas if row.polished is not None]
