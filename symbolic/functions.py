@@ -131,12 +131,12 @@ def _waypoints(task: Task, x: ca.MX, handed: dict[str, ca.MX]) -> ca.MX:
 def _constraints(
     workcell: Workcell, values: dict[str, ca.MX], n: int, handed: dict[str, ca.MX]
 ) -> ca.MX:
-    """Build the values (9, n) of `CONSTRAINTS` at n samples. A value is at most 0 where the sample
-    satisfies the constraint.
+    """Build the constraint values (9, n) at n samples, one row for each of `CONSTRAINTS`. A value
+    is at most 0 where the sample satisfies the constraint.
 
     Args:
         workcell: cell with symbolic parameters.
-        values: quantities at the samples (rows, n) by name, at least `_CONSTRAINT_INPUTS`.
+        values: quantities (rows, n) at the samples by name, at least those in `_CONSTRAINT_INPUTS`.
         n: number of samples.
         handed: the cell's symbolic parameters by name of their group.
     """
@@ -374,8 +374,12 @@ _CONSTRAINT_INPUTS = (
 
 
 def _constraint_function(workcell: Workcell) -> ca.Function:
-    """Build the function from the quantities `_CONSTRAINT_INPUTS` of one sample to the constraint
-    values (9,) in the order of `CONSTRAINTS`."""
+    """Build the function of the constraint values (9,) of one sample, in the order of
+    `CONSTRAINTS`. A value is at most 0 where the sample satisfies the constraint.
+
+    Inputs: the quantities that `_CONSTRAINT_INPUTS` names, from inverse kinematics and contact
+    forces.
+    """
     sizes = {"normal_force": 2, "tangential_force": 2, "pressure_shift": 2}
     inputs = {name: ca.SX.sym(name, sizes.get(name, 1)) for name in _CONSTRAINT_INPUTS}
     given = sx_parameters(*workcell.robots, workcell.payload)
@@ -448,12 +452,12 @@ def cell_functions(model: CellModel) -> dict[str, ca.Function]:
 def branch_functions(model: CellModel) -> dict[str, ca.Function]:
     """Build the functions that find the start branches of the arms, by name.
 
-    poses: waypoints (6 + m, w) -> poses (6 + m, n), the poses of all samples, extended by the m
-    redundant joints.
-
-    approach_i, for arm i = 1, 2: inverse kinematics at the start, see `symbolic.robot.branches`.
-
-    follow_i, for arm i = 1, 2: joints along the path, see `symbolic.robot.arm.follow_function`.
+    - poses takes waypoints (6 + m, w), the extended poses at w waypoints. It returns poses (6 + m,
+      n), the extended poses of all samples.
+    - approach_i, for arm i = 1, 2, solves the inverse kinematics at the start; see
+      `symbolic.robot.branches.approach_function`.
+    - follow_i, for arm i = 1, 2, computes the joints along the path; see
+      `symbolic.robot.arm.follow_function`.
     """
     task = model.workcell.task
     waypoints = ca.SX.sym("waypoints", task.extended_size, len(task.waypoints))

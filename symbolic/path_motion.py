@@ -76,11 +76,12 @@ def path_motion_function(model: CellModel, samples: int) -> ca.Function:
     """Build the function of a carry's geometry at n uniform samples of the path parameter u in [0,
     1].
 
-    Input: x (n_var,), the decision vector; then the cell's symbolic parameters. Outputs (NumPy
-    shapes): pose (n, 6) of the box [m, rad]; pose_first and pose_second (n, 6), its first and
-    second derivative by u; `BOX_OUTPUTS`; then for each arm i = 1, 2
-    `symbolic.robot.arm.TRACK_OUTPUTS` (without joint_torque) and `ARM_OUTPUTS`, with the suffix _i,
-    for example q_1 (n, joints).
+    Input: x (n_var,), the decision vector; then the cell's symbolic parameters.
+
+    Outputs (NumPy shapes): pose (n, 6) of the box [m, rad]; pose_first and pose_second (n, 6), its
+    first and second derivative by u; the outputs of `box_function`. For each arm i = 1, 2 follow,
+    with the suffix _i: joint positions and further `symbolic.robot.arm.TRACK_OUTPUTS` except
+    joint_torque, and the outputs of `arm_derivative_function`; for example q_1 (n, joints).
 
     Args:
         model: the cell.
@@ -154,10 +155,13 @@ def extended_motion(
 
 
 def box_function(workcell: Workcell) -> ca.Function:
-    """Build the function of the box's required force, required moment and rotation at one sample.
+    """Build the function of the box's required force and moment at one sample of a path, as
+    coefficients of the timing.
 
     Inputs: pose, first, second (6,), the box pose [m, rad] and its first and second derivative by
-    u; then the payload's symbolic parameters. Outputs: `BOX_OUTPUTS`.
+    u; then the payload's symbolic parameters. Outputs, listed with shapes in `BOX_OUTPUTS`:
+    rotation of the box, normal of contact 1, and the coefficients of u'' and u'^2 in angular
+    motion, required force and required moment, world frame.
     """
     pose, first, second = (ca.SX.sym(name, 6) for name in ("pose", "first", "second"))
     payload = workcell.payload
@@ -189,7 +193,9 @@ def arm_derivative_function(
 
     Inputs: q (n,), the joint positions that hold the box at this pose; pose, first, second (6 +
     m,), the extended pose and its first and second derivative by u; then the robot's symbolic
-    parameters. Outputs: `ARM_OUTPUTS`.
+    parameters. Outputs, listed with shapes in `ARM_OUTPUTS`: first and second derivative of q by u;
+    joint torques of the arm without the box by u'', by u'^2 and at rest; joint torques per unit of
+    contact wrench.
 
     Args:
         robot: description of the arm.

@@ -187,7 +187,7 @@ def _short(value: object) -> str:
 
 
 def as_text(found: CampaignComparison) -> str:
-    """Format a comparison for a terminal."""
+    """Format the comparison of two campaigns as text for a terminal."""
     lines = [f"A: {found.runs[0]}", f"B: {found.runs[1]}", ""]
     if not found.same_workcell:
         lines += ["The workcells differ: the figures say more about them than about the runs.", ""]

@@ -71,8 +71,8 @@ FunctionSets: TypeAlias = "list[tuple[Mapping[str, ca.Function], str]]"
 
 
 def _function_sets(cell: CompiledCell) -> FunctionSets:
-    """Build the CasADi functions of the evaluator: each set by name, with the set's key in the
-    cache."""
+    """Build the CasADi functions of the evaluator in sets. Each set has its functions by name, and
+    its key in the cache."""
     from symbolic.functions import arm_functions
 
     symbols = cell.symbols

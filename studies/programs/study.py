@@ -152,8 +152,12 @@ def report_stage(study: StudySettings) -> Stage:
 
 
 def _paths_beside(folder: CampaignFolder) -> Array:
-    """Return paths (m, n_path) that the first experiment of a study found, as starts for the
-    drivable experiment in the folder."""
+    """Return good paths (m, n_path) of a study's first experiment, with which the search of the
+    drivable experiment starts.
+
+    Args:
+        folder: folder of the drivable experiment, inside that of the study.
+    """
     return known_paths(folder.root.parent, folder.workcell.task)
 
 

@@ -202,6 +202,7 @@ def phases(jobs: Sequence[DrawnJob], robots: Sequence[str]) -> Table:
     """Return the table of the phases of jobs: times, largest forces, and used shares of the limits.
 
     Args:
+        jobs: jobs around trajectories, some of which may have failed.
         robots: names of both robots.
     """
     rows: list[tuple[str, ...]] = []

@@ -78,12 +78,12 @@ class ConvexProgram(Protocol):
 
     @property
     def cell_sizes(self) -> tuple[tuple[str, int], ...]:
-        """(name, number of entries) of each input of the program."""
+        """(name, number of entries) of each input of the convex program, in order."""
 
     @property
     def given(self) -> dict[str, ca.SX]:
-        """Symbolic parameters of the cell in the program's formulas, by name of the parameter
-        group. Compiled functions take these parameters after the inputs `cell_sizes`."""
+        """Symbolic parameters of the cell in the convex program's formulas, by name of the
+        parameter group. Compiled functions take these parameters after the inputs `cell_sizes`."""
 
     def free(self, wrenches: list[ca.SX]) -> ca.SX:
         """Select the free components of the scaled wrenches of all contacts, as one column. The
@@ -96,7 +96,7 @@ class ConvexProgram(Protocol):
 
     def effort(self, wrenches: list[ca.SX], cell: list[ca.SX]) -> ca.SX:
         """Compute the cost of the scaled wrenches of all contacts: a scalar, the sum over the
-        contacts of convex terms of degree two at most. `cell` lists the program's inputs."""
+        contacts of convex terms of degree two at most. `cell` lists the convex program's inputs."""
 
     def start(self, cell: list[ca.SX]) -> tuple[list[ca.SX], ca.SX]:
         """Return the start of the method for the inputs `cell`: the state (n,) of each patch,
@@ -128,8 +128,8 @@ class Patch(ABC):
 
     @abstractmethod
     def centred(self, state: ca.SX, weight: ca.SX) -> ca.SX:
-        """Return the iterate (iterate_size,) of a state (n,): the state, and the multipliers for
-        which X S equals the barrier's weight `weight`."""
+        """Return the iterate (iterate_size,) of a state (n,): the state, and the multipliers that
+        belong to it on the central path, which are -`weight` times the gradient of the barrier."""
 
     @abstractmethod
     def local(self, iterate: ca.SX) -> LocalPatch:
@@ -138,14 +138,13 @@ class Patch(ABC):
 
     @abstractmethod
     def potential(self, state: ca.SX) -> ca.SX:
-        """Compute the value (scalar) of the cone's barrier function at a state (n,). Its gradient
-        times minus the weight gives the multipliers of `centred`."""
+        """Compute the barrier function (scalar) of the patch's friction cone at a state (n,). It
+        grows without limit towards the cone's boundary."""
 
     @abstractmethod
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
-        """Compute -1 / t, where t > 0 is a step length with which `state` + t `change`, both (n,),
-        is still within the cone. It bounds the relative changes of the eigenvalues of X from below.
-        """
+        """Compute -1 / t, where t > 0 is a step length, nearly the longest, with which `state` + t
+        `change`, both (n,), is still within the cone."""
 
     @abstractmethod
     def slack(self, state: ca.SX) -> ca.SX:
@@ -237,10 +236,10 @@ def least_effort(program: ConvexProgram, *cell: ca.MX, differentiable: bool = Fa
 
 @lru_cache(PROGRAMS)
 def central_path(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
-    """Build the function that solves a program by the interior-point method.
+    """Build the function that solves a convex program by the interior-point method.
 
-    It maps the program's inputs and symbolic parameters to one column, the iterates of all patches,
-    near the central path at a weight of `final_weight` times the effort.
+    Inputs: the program's inputs, then its symbolic parameters. Output: one column, the iterates of
+    all patches, near the central path at a weight of `final_weight` times the effort.
     """
     cell = _mx_inputs(program)
     step = _step(program, final_weight)
@@ -250,10 +249,11 @@ def central_path(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> 
 
 @lru_cache(PROGRAMS)
 def centred(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
-    """Build the function that solves a program and moves the solution onto the central path.
+    """Build the function that solves a convex program and moves the solution onto the central path.
 
-    It maps the program's inputs and symbolic parameters to one column, the states of all patches,
-    at a weight of `final_weight` times the effort. CasADi takes its derivatives as zero.
+    Inputs: the program's inputs, then its symbolic parameters. Output: one column, the states of
+    all patches, at a weight of `final_weight` times the effort. CasADi takes its derivatives as
+    zero.
     """
     cell = _mx_inputs(program)
     owns = ca.vertsplit(central_path(program, final_weight)(*cell), ends_of(program))
@@ -398,8 +398,8 @@ def _length(lowest: list[ca.SX], share: ca.SX | float) -> ca.SX:
 
 @lru_cache(PROGRAMS)
 def _start(program: ConvexProgram) -> ca.Function:
-    """Build the function from the program's inputs to the first iterate: the states of the
-    program's start, with multipliers as on the central path."""
+    """Build the function from a convex program's inputs to the first iterate of all patches: the
+    states of `ConvexProgram.start`, with multipliers as on the central path."""
     cell = _sx_inputs(program)
     states, share = program.start(cell)
     effort = program.effort(wrenches_of(program, states), cell)
@@ -437,8 +437,8 @@ class Factors:
     """
 
     def __init__(self, matrix: ca.SX, k: int | None = None) -> None:
-        """Factor the first `k` unknowns of `matrix` (n, n), read from its lower triangle; None for
-        all n."""
+        """Compute the factors L D L' of the first `k` unknowns of `matrix` (n, n), which is read
+        from its lower triangle; None for all n."""
         n = range(matrix.shape[0])
         rows = [[matrix[i, j] for j in range(i + 1)] for i in n]
         self._below: list[dict[int, ca.SX]] = []  # the columns of L, without zeros
@@ -490,7 +490,7 @@ class Equations:
     def __init__(
         self, program: ConvexProgram, cell: list[ca.SX], states: list[ca.SX], stiffness: list[ca.SX]
     ) -> None:
-        """Factor the equations.
+        """Build Newton's equations of effort plus barriers at given states, and factor them.
 
         Args:
             program: the convex program.
@@ -579,7 +579,7 @@ def wrenches_of(program: ConvexProgram, owns: list[AnyExpression]) -> list[AnyEx
 
 
 def degree_of(program: ConvexProgram) -> float:
-    """Return the sum of the degrees of a program's patches."""
+    """Return the sum of the degrees of a convex program's patches."""
     return sum(patch.degree for patch in program.patches)
 
 

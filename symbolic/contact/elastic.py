@@ -25,11 +25,12 @@ from symbolic.records import Contact, Workcell
 
 
 def layer_shares(pads: Sequence[Contact]) -> Array:
-    """Compute how a load is shared among n pads on elastic layers: one matrix (6, 6) per pad, (n,
-    6, 6).
+    """Compute how a load is shared among n pads on elastic layers.
 
-    A matrix maps the load, force and moment about the box frame's origin along the box's axes, to
-    the pad's wrench on the payload, about the pad's origin along the pad's axes [N, N m].
+    Returns:
+        (n, 6, 6) one matrix per pad. It maps the load, force [N] and moment [N m] about the box
+        frame's origin along the box's axes, to the pad's wrench on the payload, about the pad's
+        origin along the pad's axes.
     """
     maps, stiff = [wrench_to_box(pad) for pad in pads], [layer_stiffness(pad) for pad in pads]
     whole = sum(A @ K @ A.T for A, K in zip(maps, stiff, strict=True))

@@ -336,8 +336,8 @@ def derive_grasp_numbers(workcell: Workcell, reach: float = 1.0) -> GraspNumbers
 
 
 def grasp_shapes(workcell: Workcell) -> dict[str, Any]:
-    """Return the shape of every array of `GraspNumbers` by the field's name; the entry `shapes`
-    holds one shape per pad."""
+    """Return the shape of every array of `GraspNumbers` by the field's name. The field `shapes` has
+    one shape per pad."""
     pads = workcell.pads
     b, n = len(dependent_components(workcell)), len(EVEN) * len(pads)
     return {

@@ -286,13 +286,13 @@ class Grasp:
     def solve(
         self, cell: list[ca.MX], given: Sequence[ca.MX], differentiable: bool = False
     ) -> ca.MX:
-        """Build the expression of the pad wrenches of least effort, (6 k,) for k pads, with entries
-        as in `grasp_wrenches` [N, N m]. Normal forces exceed any limit if friction does not close
-        the grasp.
+        """Build the expression of the pad wrenches of least effort, (6 k,) for k pads, as
+        `grasp_wrenches` describes them [N, N m].
 
         Args:
-            cell: the program's inputs; the first is the load (6,) about the box frame's origin,
-                along the box's axes [N, N m].
+            cell: inputs of the convex program: load (6,) about the box frame's origin, along the
+                box's axes [N, N m]; friction (2,) of each robot's pads; in some programs relative
+                patch sizes (2,).
             given: symbolic parameters of the grasp.
             differentiable: True for exact first derivatives.
         """
@@ -379,7 +379,7 @@ def grasp_wrenches(
     any limit if friction does not close the grasp.
 
     Args:
-        grasp: program of the pads.
+        grasp: convex program of the pads.
         load: (6,) force and moment about the box frame's origin, along the box's axes [N, N m].
         friction: (2,) Coulomb coefficients of the robots' pads.
         given: symbolic parameters of the grasp.

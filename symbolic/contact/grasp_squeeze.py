@@ -154,18 +154,18 @@ def commanded_forces(
     handed: dict[str, ca.MX] | None = None,
     differentiable: bool = False,
 ) -> ca.MX:
-    """Build the expression of the robots' normal forces (2,) [N]: the least commanded force, which
-    is convex in the load, and the force of the other robot that results. Both exceed any limit if
-    friction does not close the grasp.
+    """Build the expression of the robots' normal forces (2,) [N]: the least commanded force of one
+    robot, which is convex in the load, and the resulting force of the other. Both exceed any limit
+    if friction does not close the grasp.
 
     Args:
-        squeeze: program with the commanded robot.
+        squeeze: convex program, which knows the commanded robot.
         load: (6,) force and moment about the box frame's origin, along the box's axes [N, N m].
         friction: (2,) Coulomb coefficients of the robots' pads.
         share: (2,) sizes of the robots' patches over the cell's own sizes.
         displacement: (4,) displacements of the first, then of the second robot's pads along their
             tangents [m].
-        handed: symbolic parameters of the program by group.
+        handed: symbolic parameters of the convex program by group.
         differentiable: True for exact first derivatives.
     """
     handed = handed or {}
@@ -182,18 +182,19 @@ def commanded_slack(
     displacement: ca.SX,
     force: ca.SX,
 ) -> ca.SX:
-    """Build the slack of a commanded force, a scalar that is positive only if the force holds the
-    load. It may be negative although the force suffices.
+    """Build the slack of a commanded force, a scalar: a positive slack proves that the force holds
+    the load. A negative slack proves nothing.
 
     The tested forces are the least-norm states that balance the load, plus as much internal squeeze
     as the commanded force leaves. The slack is positive if these forces lie within all cones.
 
     Args:
-        squeeze: program with the commanded robot.
+        squeeze: convex program, which knows the commanded robot.
         load: (6,) force and moment about the box frame's origin, along the box's axes [N, N m].
         friction: (2,) Coulomb coefficients of the robots' pads.
         share: (2,) sizes of the robots' patches over the cell's own sizes.
-        displacement: (4,) displacements of the robots' pads along their tangents [m].
+        displacement: (4,) displacements of the first, then of the second robot's pads along their
+            tangents [m].
         force: commanded normal force [N].
     """
     reach = share / squeeze.numbers.reach

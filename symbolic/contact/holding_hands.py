@@ -97,16 +97,15 @@ class HandPatch:
 def required_holding_forces(
     wrench: Expression, friction: Expression, patch: HandPatch
 ) -> tuple[Expression, Expression]:
-    """Compute two least holding forces [N]: one keeps a hand's rim from lifting off, one keeps the
-    hand from sliding.
+    """Compute two least holding forces of a hand [N]: the first keeps its rim from lifting off, the
+    second keeps it from sliding.
 
-    These are the right sides of (1) and (2) of the module. Both are negative if the load presses
-    the hand onto the payload strongly enough.
+    A negative result means that the load presses the hand onto the payload strongly enough.
 
     Args:
         wrench: (6,) wrench of the hand on the payload about the hand's origin, along the hand's
-            axes: tangential force (2,), normal force [N], moments about the two tangents, torsion
-                [N m].
+            axes: tangential force (2,) and normal force [N], moments about the two tangents and
+            torsion [N m].
         friction: Coulomb coefficient of the hand.
         patch: patch of the hand.
     """
@@ -128,9 +127,10 @@ def internal_force_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Arra
     each other.
 
     The push results from an error of the arms' relative pose; the elastic layers of the two arms
-    are springs in series. A push f, a unit vector, needs g(f) - n . f more of a hand, with n the
-    normal force per newton of push along each axis, and a length g of tilting or of sliding over
-    the friction coefficient. Squared, this is at most max(g)^2 + 2 g(n) + |n|^2 in any direction.
+    are springs in series. Let f be the unit vector of the push, n . f the normal force that it adds
+    at a hand, and g(f) its tilting or its sliding over the friction coefficient, as a force. The
+    hand then needs g(f) - n . f more. The square of this is at most max(g)^2 + 2 g(n) + |n|^2 for
+    any direction f.
 
     Args:
         pads: the n hands of both arms.

@@ -68,7 +68,9 @@ def load_function(workcell: Workcell) -> ca.Function:
     motion.
 
     Inputs: pose, rate, second_rate (6,), the box pose [m, rad] and its first and second time
-    derivative; then the payload's symbolic parameters. Outputs: `LOAD_OUTPUTS`.
+    derivative; then the payload's symbolic parameters. Outputs, listed with shapes in
+    `LOAD_OUTPUTS`: angular velocity and acceleration, normal, tangential and contact forces, shifts
+    of the centres of pressure, required and unbalanced moments, and the wrench of each robot.
     """
     payload = workcell.payload
     own: list[Expression] = [frictions(workcell), ca.SX(number(payload.centre_of_mass))]
@@ -110,7 +112,7 @@ def uncertain_load_function(workcell: Workcell) -> ca.Function:
 
     Inputs: pose, rate, second_rate (6,), the box pose and its time derivatives; friction (2,), the
     Coulomb coefficients; centre_of_mass (3,), box frame [m]; then the payload's symbolic
-    parameters. Outputs: `LOAD_OUTPUTS`.
+    parameters. Outputs: as `load_function`.
     """
     if contact_model(workcell).has_closed_form:
         return _closed_load_function(workcell)
@@ -202,9 +204,9 @@ def required(
 def _sample_function(workcell: Workcell) -> ca.Function:
     """Build the function of the pads' forces at one sample, for pads with any normals.
 
-    Inputs: `SAMPLE_SIZES` (pose, required force and moment about the centre of mass along world
-    axes, friction, centre of mass), then the payload's symbolic parameters. Outputs:
-    `GRASP_OUTPUTS`.
+    Inputs: pose (6,) of the box; required force (3,) and moment (3,) about the centre of mass,
+    world axes; friction (2,); centre_of_mass (3,), box frame; then the payload's symbolic
+    parameters. Outputs: those of `load_function` that `GRASP_OUTPUTS` names.
     """
     inputs, given = [ca.MX.sym(*entry) for entry in SAMPLE_SIZES], mx_parameters(workcell.payload)
     pose, force, moment, friction, centre_of_mass = inputs
@@ -258,10 +260,13 @@ def box_load_function(workcell: Workcell) -> ca.Function:
 
 
 def grasp_world_function(workcell: Workcell) -> ca.Function:
-    """Build the function that converts the wrenches of k pads to `GRASP_OUTPUTS` in world axes.
+    """Build the function that converts the wrenches of k pads to forces, shifts of the centres of
+    pressure and unbalanced moments in world axes: those outputs of `load_function` that
+    `GRASP_OUTPUTS` names.
 
-    Inputs: pose, force, moment and centre_of_mass as in `box_load_function`; wrenches (6 k,) with
-    entries as in `symbolic.contact.grasp.grasp_wrenches`; then the payload's symbolic parameters.
+    Inputs: pose (6,) of the box; force (3,) and moment (3,) about the centre of mass that the
+    motion requires, world axes; centre_of_mass (3,), box frame [m]; wrenches (6 k,) as
+    `symbolic.contact.grasp.grasp_wrenches` describes them; then the payload's symbolic parameters.
     """
     pose, _, moment, centre_of_mass = inputs = [ca.SX.sym(*entry) for entry in _ASKED]
     pads, robots = workcell.pads, workcell.pad_robots

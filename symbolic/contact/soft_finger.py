@@ -185,12 +185,12 @@ def least_soft_squeeze(
     offset: bool = False,
     implicit: ImplicitVariables | None = None,
 ) -> SoftFingers:
-    """Compute the forces of two soft fingers that balance a load with the least squeeze. All
-    vectors are along the tangents and the normal of contact 1.
+    """Compute the forces of two soft fingers that balance a load with the least squeeze.
 
     Args:
         force, moment: (3,) force [N] and moment about the centre of mass [N m] that both contacts
-            exert together on the payload.
+            exert together on the payload. These and `arms` are along the two tangents and the
+            normal of contact 1.
         arms: for each contact the vector (3,) from the centre of mass to the contact point [m].
         friction: (2,) Coulomb coefficients.
         patches: patches of both pads.

@@ -121,10 +121,11 @@ def joint_torque(
 def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str) -> ca.Function:
     """Build the function that moves an arm to the next sample of a box path.
 
-    Inputs: state (3 n + 1,), which holds the joints at the previous sample, their first and second
-    difference between samples, and `lost`; pose (6 + m,), the extended pose of the sample; wrench
-    (6,) on the box about the nominal contact point, world axes [N, N m]. Outputs: next_state, then
-    `TRACK_OUTPUTS`.
+    Inputs: state (3 n + 1,), which holds the joints (n,) at the previous sample, their first and
+    second difference between samples, and 1 if the path was lost, else 0; pose (6 + m,), the
+    extended pose of the sample; wrench (6,) on the box about the nominal contact point, world axes
+    [N, N m]. Outputs: next_state, then `TRACK_OUTPUTS`: joints, pose residual, lost, joint-limit
+    margin, manipulability, joint torque.
 
     Args:
         robot, model, contact: the arm, its model, and its contact with the box.
@@ -286,12 +287,13 @@ def follow_function(
 ) -> ca.Function:
     """Build the function of an arm's motion along all samples of a box path.
 
-    Inputs: start (n,), joints at the first box pose [rad]; pose (6 + m, samples), the extended
-    poses; wrench (6, samples) on the box about the nominal contact point [N, N m]. Outputs:
-    `TRACK_OUTPUTS` of all samples, one column per sample.
+    Inputs: start (n,), joints at the first box pose [rad or m]; pose (6 + m, samples), the extended
+    poses; wrench (6, samples) on the box about the nominal contact point, world axes [N, N m].
+    Outputs of all samples, one column per sample: `TRACK_OUTPUTS`, which are joints, pose residual,
+    lost, joint-limit margin, manipulability and joint torque.
 
-    The second sample has no earlier motion to extrapolate, so Newton steps from the start
-    posture predict its joints.
+    The second sample has no earlier motion to extrapolate, so Newton steps from the start posture
+    predict its joints.
 
     Args:
         robot, model, contact: the arm, its model, and its contact with the box.
