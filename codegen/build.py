@@ -181,11 +181,11 @@ class Build:
 def compiler_of(cache: Cache) -> Compiler:
     """Return the C compiler of this machine.
 
-    On a machine without compiler, return the record of the one that made the cached libraries for
-    this type of processor: their keys depend on it.
+    On a machine without compiler, return the record of the compiler that made the cached libraries
+    for this type of processor, because the keys of these libraries depend on it.
 
     Raises:
-        CodegenError: no compiler works, and the cache has no record of one or CC names one.
+        CodegenError: no compiler works, and either CC names one or the cache has no record.
     """
     try:
         return find_compiler()

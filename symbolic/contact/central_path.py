@@ -220,11 +220,11 @@ def least_effort(program: ConvexProgram, *cell: ca.MX, differentiable: bool = Fa
     all patches.
 
     Args:
-        program: the convex program.
+        program: the convex program, which defines the effort.
         cell: the program's inputs, then its symbolic parameters.
         differentiable: True for exact first derivatives. Further steps then move the wrenches onto
-            the central path, and only the last step is differentiated. Second derivatives are
-            wrong.
+            the central path, and only the last step is differentiated. Second derivatives are not
+            exact.
     """
     if differentiable:
         states, _ = barrier_step(program)(centred(program)(*cell), 1.0, *cell)
@@ -239,7 +239,7 @@ def central_path(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> 
     """Build the function that solves a convex program by the interior-point method.
 
     Inputs: the program's inputs, then its symbolic parameters. Output: one column, the iterates of
-    all patches, near the central path at a weight of `final_weight` times the effort.
+    all patches, near the central path for barriers weighted by `final_weight` times the effort.
     """
     cell = _mx_inputs(program)
     step = _step(program, final_weight)
@@ -252,8 +252,8 @@ def centred(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Fu
     """Build the function that solves a convex program and moves the solution onto the central path.
 
     Inputs: the program's inputs, then its symbolic parameters. Output: one column, the states of
-    all patches, at a weight of `final_weight` times the effort. CasADi takes its derivatives as
-    zero.
+    all patches, for barriers weighted by `final_weight` times the effort. CasADi takes its
+    derivatives as zero.
     """
     cell = _mx_inputs(program)
     owns = ca.vertsplit(central_path(program, final_weight)(*cell), ends_of(program))
@@ -535,10 +535,10 @@ class Equations:
         return moved + ca.horzcat(*map(self.balanced_change, pulls))
 
     def balanced_change(self, pull: ca.SX) -> ca.SX:
-        """Solve Newton's equations for a change of the pads' forces that adds nothing to their sum.
+        """Solve Newton's equations for a change of the states with which the load stays balanced.
 
         Args:
-            pull: (n,) right side of the equations, an entry per entry of all patches' states.
+            pull: (n,) right side of the equations, one number per entry of all patches' states.
 
         Returns:
             Change (n,) of the states, the wrenches and further variables of all patches.

@@ -76,11 +76,8 @@ class EvenPatch(Patch):
         return -ca.log(torsion_capacity(grip, state[1:3], self.shape)[0] ** 2 - state[3] ** 2)
 
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
-        """Compute -1 / t for a step length t with which `state` + t `change`, both (4,), stays
-        within the cone.
-
-        t is nearly the longest such length.
-        """
+        """Compute -1 / t for a step length t > 0 with which `state` + t `change`, both (4,), is
+        still within the cone. t is nearly the longest such length."""
         # The friction limit: the lower eigenvalue of (N, T).
         square = self._grip_squared(state)
         mean = (state[0] * change[0] - ca.dot(state[1:3], change[1:3])) / square
@@ -96,9 +93,12 @@ class EvenPatch(Patch):
         return -1.0 / ca.fmax(near, LEAST_LENGTH)
 
     def slack(self, state: ca.SX) -> ca.SX:
-        """Compute the margin of a state (4,), scaled like the state: the torsion that the patch
-        could bear in addition, or minus the missing friction if the tangential force alone makes
-        the patch slide."""
+        """Compute the margin of a state (4,) to sliding, scaled like the state; it is negative if
+        the patch slides.
+
+        If friction bears the tangential force, the margin is the largest torsion beside this force
+        minus the torsion of the state. Otherwise it is minus the missing friction.
+        """
         grip = ca.sqrt(ca.fmax(self._grip_squared(state), 0.0))
         torsion = torsion_capacity(grip, state[1:3], self.shape)[0] - ca.fabs(state[3])
         friction = state[0] - ca.sqrt(ca.sumsqr(state[1:3]))
@@ -148,7 +148,7 @@ class LocalEven:
         """Compute the multipliers (4,) after a Newton step that leaves the state unchanged.
 
         Args:
-            weight: weight of the barrier at which the step aims.
+            weight: weight of the barrier after the step.
             correction: (4,) second-order correction.
         """
         return -weight * self.slope - correction
@@ -157,7 +157,7 @@ class LocalEven:
         """Compute the Newton step that belongs to a change of the state.
 
         Args:
-            weight: weight of the barrier at which the step aims.
+            weight: weight of the barrier after the step.
             correction: (4,) second-order correction.
             change: (4,) change of the state.
         """

@@ -195,7 +195,7 @@ class Grasp:
         return [c + press * s for c, s in zip(chosen, given, strict=True)], share
 
     def _squeeze_scale(self, given: list[ca.SX], asked: list[ca.SX]) -> ca.SX:
-        """Compute a factor on the internal squeeze. States plus this multiple of the squeeze lie
+        """Compute a factor on the internal squeeze with which given states plus the squeeze lie
         within the friction cones.
 
         Args:

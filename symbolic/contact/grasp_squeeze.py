@@ -212,12 +212,12 @@ def commanded_slack(
 
 
 def internal_force_gain(squeeze: GraspSqueeze) -> ca.Function:
-    """Build the function of the additional commanded force that the arms need if they push against
-    each other along the faces, per newton of this push at any pad.
+    """Build the function of the rise of the commanded force that bears a push of the arms against
+    each other, in newtons per newton.
 
-    The additional squeeze raises the friction, which bears the push. Inputs: friction coefficients
-    (2,) and relative patch sizes (2,) of the robots, then the symbolic parameters. Output: a scalar
-    [N/N].
+    The push is a tangential force at any of the pads; the friction of the additional squeeze bears
+    it. Inputs: friction coefficients (2,) and relative patch sizes (2,) of the robots, then the
+    symbolic parameters. Output: the rise, a scalar.
     """
     friction, share = ca.SX.sym("friction", 2), ca.SX.sym("share", 2)
     given = squeeze.squeeze_states(friction, share / squeeze.numbers.reach)

@@ -301,8 +301,12 @@ class HoldingHands(ContactModel):
         )
 
     def friction_lost(self, apart: Array) -> Array:
-        """Return zeros (k,): displacements `apart` (k,) [m] of hands, which need no squeeze, cost
-        no friction."""
+        """Return k zeros: displaced hands lose no friction, because they need no squeeze that a
+        displacement could turn into a moment.
+
+        Args:
+            apart: (k,) displacements of the two arms' hands relative to each other [m].
+        """
         return 0.0 * apart
 
     def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:

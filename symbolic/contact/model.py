@@ -239,8 +239,15 @@ class ContactModel(ABC):
         return np.asarray(left - self.friction_lost(apart))
 
     def friction_lost(self, apart: Array) -> Array:
-        """Compute the reduction (k,) of the friction coefficient that covers each of k relative
-        displacements `apart` (k,) of the pads [m]."""
+        """Compute how much lower the friction coefficient has to be assumed to cover displaced
+        pads.
+
+        Args:
+            apart: (k,) displacements of the two pads relative to each other along the faces [m].
+
+        Returns:
+            (k,) reductions of the friction coefficient.
+        """
         return apart / self.workcell.pad_distance
 
     def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
@@ -294,8 +301,12 @@ class ContactModel(ABC):
         return ca.dot(load.force, load.axes[:, 2])
 
     def internal_force_ratio(self, leader: int) -> Array:
-        """Return the rise (2,) of each robot's normal force per newton by which the
-        force-controlled robot presses more. `leader` is the index of the other robot."""
+        """Return the rise (2,) of each robot's normal force if the force-controlled robot presses
+        harder, per newton of this robot's rise.
+
+        Args:
+            leader: index of the robot that is not force-controlled.
+        """
         return np.ones(2)
 
     def raised(self, planned: Array, extra: Array, leader: int) -> Array:

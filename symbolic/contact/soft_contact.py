@@ -120,8 +120,11 @@ class SoftFingerGrasp(SoftFinger):
         )
 
     def friction_lost(self, apart: Array) -> Array:
-        """Return zeros (k,) for k displacements `apart` [m]: worst cases displace these pads
-        explicitly, not by a lower friction."""
+        """Return k zeros: worst cases displace these pads explicitly, not by a lower friction.
+
+        Args:
+            apart: (k,) displacements of the two robots' pads relative to each other [m].
+        """
         return 0.0 * apart
 
     def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
@@ -153,8 +156,11 @@ class SoftFingerGrasp(SoftFinger):
         return np.asarray(normals / normals[::-1])
 
     def internal_force_ratio(self, leader: int) -> Array:
-        """Return the rise (2,) of each robot's normal force in the pads' internal squeeze, per
-        newton by which the force-controlled robot presses more. `leader` is the index of the other
-        robot."""
+        """Return the rise (2,) of each robot's normal force if the force-controlled robot presses
+        harder, per newton of this robot's rise. The ratio is that of the internal squeeze.
+
+        Args:
+            leader: index of the robot that is not force-controlled.
+        """
         normals = Grasp(self.workcell).squeeze_normals()
         return np.asarray(normals / normals[1 - leader])

@@ -246,8 +246,8 @@ def _robot_bodies(robot: Robot, i: int, links: ArmLinks, meshes: MeshReader) -> 
 def _standing_bodies(
     robots: tuple[Robot, Robot], i: int, links: tuple[ArmLinks, ArmLinks], meshes: MeshReader
 ) -> list[CollisionBody]:
-    """Return the links of an arm's machine that do not move, as collision bodies. There are none if
-    the description has no links beside the arm's.
+    """Return the links of an arm's machine that no joint moves, as collision bodies. The list is
+    empty if the description consists of the arm only.
 
     Args:
         robots: descriptions of both arms.

@@ -220,7 +220,8 @@ class DistanceBounds:
         [m].
 
         Args:
-            obstacle: numbers (BOX_NUMBERS,) of the fixed box from `box_numbers`; may be symbols.
+            obstacle: (BOX_NUMBERS,) rotation row by row, centre and half edges of the fixed box in
+                the world, as from `box_numbers`; may be symbols.
             direction: (3,) unit vector in the world, from the fixed box towards the payload.
         """
         rotation, centre = ca.reshape(obstacle[:9], 3, 3).T, obstacle[9:12]

@@ -44,46 +44,49 @@ class Softness:
     turn: float | None = None
 
     def absolute_above(self, x: ca.SX) -> ca.SX:
-        """Compute abs(x), or up to `width` more."""
+        """Compute a smooth upper bound of abs(x), at most `width` larger."""
         return ca.sqrt(x * x + self.width**2) if self.width else ca.fabs(x)
 
     def entry_above(self, x: ca.SX) -> ca.SX:
-        """Compute abs(x) of an entry x of a rotation, or up to `turn` more."""
+        """Compute a smooth upper bound of abs(x), at most `turn` larger, for an entry x of a
+        rotation matrix."""
         turn = self.width if self.turn is None else self.turn
         return ca.sqrt(x * x + turn**2) if turn else ca.fabs(x)
 
     def absolute_below(self, x: ca.SX) -> ca.SX:
-        """Compute abs(x), or up to `width` less."""
+        """Compute a smooth lower bound of abs(x), at most `width` smaller."""
         return self.absolute_above(x) - self.width
 
     def ramp_above(self, x: ca.SX) -> ca.SX:
-        """Compute max(x, 0) or up to half a width more; never negative."""
+        """Compute a smooth upper bound of max(x, 0), at most half of `width` larger; it is never
+        negative."""
         return (x + ca.sqrt(x * x + self.width**2)) / 2.0 if self.width else ca.fmax(x, 0.0)
 
     def maximum_above(self, values: Sequence[ca.SX]) -> ca.SX:
-        """Compute the largest value or slightly more."""
+        """Compute a smooth upper bound of the largest of several values."""
         return _fold(self._pair_above if self.width else ca.fmax, values)
 
     def maximum_below(self, values: Sequence[ca.SX]) -> ca.SX:
-        """Compute the largest value or slightly less."""
+        """Compute a smooth lower bound of the largest of several values."""
         if not self.width:
             return _fold(ca.fmax, values)
         return _fold(lambda a, b: self._pair_above(a, b) - self.width / 2.0, values)
 
     def minimum_below(self, values: Sequence[ca.SX]) -> ca.SX:
-        """Compute the least value or slightly less."""
+        """Compute a smooth lower bound of the least of several values."""
         if not self.width:
             return _fold(ca.fmin, values)
         return -self.maximum_above([-value for value in values])
 
     def norm_below(self, squared: ca.SX) -> ca.SX:
-        """Compute the root of a squared length, or slightly less."""
+        """Compute a smooth lower bound of a length [m] from its square [m^2]."""
         if self.width:
             return ca.sqrt(squared + self.width**2) - self.width
         return ca.sqrt(ca.fmax(squared, _TINY)) - _TINY**0.5
 
     def cosine_above(self, sine: ca.SX) -> ca.SX:
-        """Compute sqrt(1 - sine^2) or slightly more."""
+        """Compute a smooth upper bound of sqrt(1 - sine^2), the absolute cosine that belongs to a
+        sine."""
         rest = 1.0 - sine * sine
         if self.width:
             # 1 - sine^2 may be -1e-16 by roundoff; the width keeps the root's argument positive.
@@ -141,10 +144,11 @@ def clean(matrix: Array) -> Array:
 
 
 def quaternion(R: ca.SX) -> ca.SX:
-    """Compute the unit quaternion (4,), w x y z, of a rotation (3, 3), stable for every angle.
+    """Compute the unit quaternion (4,), w x y z, of a rotation matrix R (3, 3), accurately for
+    every angle.
 
-    Each column of the matrix is 4 times the quaternion times one of its components. The column of
-    the largest component is the most accurate (Shepperd 1978).
+    The matrix of all products of two components of the quaternion follows from R. The quaternion is
+    its longest column, divided by its length (Shepperd 1978).
     """
     trace = ca.trace(R)
     x, y, z = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]

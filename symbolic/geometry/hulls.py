@@ -377,7 +377,7 @@ class _Growth:
         return not _beyond(points, self.planes)
 
     def takes_in(self, points: Array) -> bool:
-        """Return True if one hull around both may replace the hull and another hull.
+        """Return True if this hull and another hull may be replaced by one hull around both.
 
         This holds if the stretched hull contains the other hull, or if both together fit into a
         cube with the edge `SMALL_PART`.

@@ -72,10 +72,11 @@ def path_position(n_waypoints: int, parameter: Array) -> Array:
 
 @cache
 def _natural_splines(n_waypoints: int) -> tuple[Callable[[Array], Array], ...]:
-    """Build three functions from n values of u in [0, 1] to a matrix (n, n_waypoints).
+    """Build three functions of n values of u in [0, 1]: natural quintic splines, their first and
+    their second derivatives by u.
 
-    The first function evaluates natural quintic splines, the others their first and second
-    derivatives by u. Column k belongs to the spline that is 1 at waypoint k and 0 at all others.
+    Each function returns a matrix (n, n_waypoints). Column k belongs to the spline that is 1 at
+    waypoint k and 0 at all others.
     """
     # Not imported at the top: SciPy takes long to start, and compiled functions need no basis.
     from scipy.interpolate import make_interp_spline

@@ -315,7 +315,7 @@ def _tables_of(content: bytes) -> dict[str, Any]:
 
 
 def _owners(table: Any, path: str) -> Iterator[tuple[dict[str, Any], str]]:
-    """Yield every table that contains the last key of a key path, and this key.
+    """Yield every table that contains the last key of a key path, together with this key.
 
     Args:
         table: the table at which the path begins.
@@ -338,8 +338,8 @@ def _owners(table: Any, path: str) -> Iterator[tuple[dict[str, Any], str]]:
 
 
 def _among(tables: list[dict[str, Any]], rest: str) -> Iterator[tuple[dict[str, Any], str]]:
-    """Yield the results of `_owners` for an array of tables, that is, the tables that contain a
-    key.
+    """Yield the results of `_owners` for an array of tables: tables that contain the last key of
+    the path.
 
     Args:
         tables: the tables of the array.

@@ -98,8 +98,8 @@ def _record(kind: Hashable) -> tuple[bytes, tuple[str, ...]]:
     """Return what the content of every record of a class has in common.
 
     Returns:
-        The bytes with which the content begins, the counted class name; and the names of the fields
-        that belong to the content.
+        The bytes with which the content begins: the class name with its length in front; and the
+        names of the fields that belong to the content.
     """
     own: Any = kind
     names = (each.name for each in fields(own))

@@ -41,8 +41,9 @@ DIRECTION_NUMBERS = 12
 
 
 def _directions() -> Array:
-    """Return the coefficients of all separating directions, one row each: (SEPARATING_DIRECTIONS,
-    DIRECTION_NUMBERS). The obstacle's vectors are along the obstacle's own axes."""
+    """Return the coefficients of all separating directions: one row each, (SEPARATING_DIRECTIONS,
+    DIRECTION_NUMBERS), as `direction` takes them, but with the obstacle's vectors along the
+    obstacle's own axes."""
     found = []
     for first, axes in ((0, 1), (3, 1), (6, 3)):
         for k in range(3):
@@ -102,9 +103,10 @@ def gap(place: PathPointSymbols, obstacle: ca.SX, numbers: ca.SX) -> ca.SX:
     [m], smoothed at its kinks. It is positive where the direction separates the two bodies.
 
     Args:
-        place: symbols of a place of the path.
-        obstacle: (BOX_NUMBERS,) parameters of the obstacle, a box.
-        numbers: (DIRECTION_NUMBERS,) coefficients of the direction.
+        place: symbols of the box pose and the joints at one point of the path.
+        obstacle: (BOX_NUMBERS,) rotation, centre and half edges of the obstacle, a box, in the
+            world.
+        numbers: (DIRECTION_NUMBERS,) coefficients of the direction, as `direction` takes them.
     """
     n = direction(place, numbers)
     return place.scene.separation(obstacle, n / ca.norm_2(n))

@@ -148,12 +148,12 @@ class PathConstraint(ABC):
         return np.zeros(0)
 
     def arms(self, model: CellBodies) -> tuple[int, ...]:
-        """Return the indices of the arms on whose joints the value depends."""
+        """Return the indices of the arms on whose joints the constrained value depends."""
         return ()
 
     def given(self, model: CellBodies) -> dict[str, ca.SX]:
-        """Return the cell's symbolic parameters on which the value depends, by name of their group.
-        By default these are the parameters of the bodies."""
+        """Return the cell's symbolic parameters on which the constrained value depends, by name of
+        their group. By default these are the parameters of the bodies."""
         return sx_parameters(model.screen)
 
 
@@ -178,8 +178,12 @@ class Clearance(PathConstraint):
         return f"clearance_{self.column}"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Build the expression of the lower bound of the distance [m] at the symbols `place` of one
-        point of the path. `numbers` is empty."""
+        """Build the expression of the lower bound of the distance of the two bodies [m].
+
+        Args:
+            place: symbols of the box pose and the joints at one point of the path.
+            numbers: empty.
+        """
         return place.scene.bound(self.column)
 
     def arms(self, model: CellBodies) -> tuple[int, ...]:
@@ -216,7 +220,7 @@ class JointLimit(PathConstraint):
         """Build the expression of the distance to the limit [rad or m], negative beyond the limit.
 
         Args:
-            place: symbols of a place of the path.
+            place: symbols of the box pose and the joints at one point of the path.
             numbers: (count,) distance at zero joint positions, then its derivatives by the joints.
         """
         return numbers[0] + ca.dot(numbers[1:], place.q[self.arm])
@@ -265,9 +269,13 @@ class ManipulabilityLimit(PathConstraint):
         return f"reach_{self.arm + 1}"
 
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Build the expression of the value, dimensionless, at the symbols `place` of one point of
-        the path; it is zero at the least manipulability that the workcell allows. `numbers` is
-        empty."""
+        """Build the expression (D / D_min)^2 - 1 of the arm's manipulability D and its least
+        allowed value D_min, which the workcell states.
+
+        Args:
+            place: symbols of the box pose and the joints at one point of the path.
+            numbers: empty.
+        """
         least = place.model.workcell.robots[self.arm].min_manipulability
         model = place.model.robots[self.arm]
         jacobian = following_columns(model, model.jacobian(place.q[self.arm]))
