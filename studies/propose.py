@@ -19,7 +19,8 @@ from symbolic.errors import SettingsError
 
 
 def _ranges(text: str) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Parse two ranges in metres from 'LOW:HIGH,LOW:HIGH'; without the second range it is (0, 0).
+    """Parse two ranges [m] from 'LOW:HIGH,LOW:HIGH'. If the text has one range, the second one is
+    (0, 0).
 
     Raises:
         argparse.ArgumentTypeError: there are more than two ranges, or a range is reversed.

@@ -198,8 +198,8 @@ states."""
 
 
 def sample_sizes(workcell: Workcell) -> dict[str, int]:
-    """Return the number of entries of each output of the function `sample` of `sample_functions`
-    after the two states, by the output's name."""
+    """Return the number of entries of each output of the function `sample` (`sample_functions`), by
+    the output's name. The states of both arms, its first two outputs, are left out."""
     sizes = dict(_LOAD_SIZES)
     for i, robot in enumerate(workcell.robots, start=1):
         joints = robot.position_lower.shape[0]
@@ -215,8 +215,8 @@ def forces_come_last(workcell: Workcell) -> bool:
 
 
 def force_sizes(workcell: Workcell) -> dict[str, int]:
-    """Return the number of entries of each output of the function `forces` of `sample_functions`,
-    by the output's name."""
+    """Return the number of entries of each output of the function `forces` (`sample_functions`), by
+    the output's name."""
     torques = [f"joint_torque_{i}" for i in (1, 2)]
     sizes = _LOAD_SIZES | {name: sample_sizes(workcell)[name] for name in torques}
     return sizes | {"force_constraint": len(FORCE_CONSTRAINTS)}

@@ -179,14 +179,14 @@ class WorkcellParameters:
 
     @property
     def layout(self) -> dict[str, tuple[Parameter, ...]]:
-        """For each parameter group, except the start postures, its parameters in the order of the
-        group's vector."""
+        """Parameters of each group in the order of the group's vector, by the group's name. The
+        groups of the start postures are left out."""
         return {name: tuple(each for each, _ in found) for name, found in self._entries.items()}
 
     @cached_property
     def sizes(self) -> dict[str, int]:
-        """For each parameter group, except the start postures, the number of entries of its
-        vector."""
+        """Number of entries of each parameter group's vector, by the group's name. The groups of
+        the start postures are left out."""
         return {
             name: sum(prod(each.shape) for each in found) for name, found in self.layout.items()
         }

@@ -123,7 +123,8 @@ def start_posture(model: CellModel, arm: int, handed: Handed) -> ca.MX:
     Args:
         model: the cell.
         arm: index of the arm.
-        handed: inputs that hold the cell's parameters, by group; empty for plain numbers.
+        handed: MX inputs that hold the cell's symbolic parameters, by group; empty for plain
+            numbers.
     """
     start = model.start[arm]
     return (

@@ -336,8 +336,8 @@ def _moment(time: float) -> str:
 
 
 def worst_friction(workcell: Workcell) -> Workcell:
-    """Return the workcell with the least friction coefficients of its uncertainty, all else as
-    described."""
+    """Return the workcell with the least friction coefficients that its uncertainty allows. All
+    other values stay as described."""
     case = nominal_case(workcell)
     case[0:2] *= 1.0 - workcell.uncertainty.friction
     return workcell_of_case(workcell, case)

@@ -438,7 +438,7 @@ def least_force(campaign: CampaignResults, task: Task) -> dict[str, Array]:
 
 
 def is_drivable(workcell: Workcell, objectives: Sequence[str]) -> bool:
-    """Return True if an experiment already searches for carries as robots drive them.
+    """Return True if the carries of an experiment are timed as robots drive them.
 
     Args:
         workcell: cell of the experiment.

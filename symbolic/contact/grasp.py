@@ -120,6 +120,9 @@ class Grasp:
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
         """Compute the scaled wrench (4,) of each pad such that all pads together balance the load.
 
+        A scaled wrench holds normal force, tangential force (2,) over the friction coefficient, and
+        torsion over friction coefficient times patch radius.
+
         Args:
             free: (free_size,) components of the scaled wrenches that the load does not determine.
             cell: inputs of the convex program in this order: load (6,) about the box frame's
@@ -233,9 +236,8 @@ class Grasp:
         return (np.array(ca.evalf(self.friction)).ravel().tolist(),)
 
     def least_states(self, load: ca.SX, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
-        """Compute the scaled wrenches (4,) of all pads that balance a load with the least norm.
-
-        They may lie outside the friction cones.
+        """Compute the scaled wrench (4,) of each pad such that all pads together balance a load
+        with the least norm. The wrenches may lie outside the friction cones.
 
         Args:
             load: (6,) force and moment about the box frame's origin, along the box's axes.

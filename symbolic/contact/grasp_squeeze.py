@@ -77,8 +77,10 @@ class GraspSqueeze(Grasp):
         """Compute the scaled wrench (4,) of each pad such that all pads together balance the load,
         with every pad displaced along its tangents.
 
-        The displacement changes the moments of the forces. `DISPLACED` fixed-point iterations find
-        forces that balance these moments too.
+        A scaled wrench holds normal force, tangential force (2,) over the friction coefficient, and
+        torsion over friction coefficient times patch radius. The displacement changes the moments
+        of the forces. `DISPLACED` fixed-point iterations find forces that balance these moments
+        too.
 
         Args:
             free: (free_size,) components of the scaled wrenches that the load does not determine.

@@ -253,12 +253,11 @@ class ContactModel(ABC):
     def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
         """Return the worst displacements of the pads under an uncertainty.
 
-        A common displacement of both pads shifts the centre of mass relative to them.
-
         Returns:
-            Half-widths (3,) of the range of the centre of mass along the box axes [m], enlarged by
-            common displacements; and k cases (k, 4) of the pads' displacements along their
-            tangents, two entries per robot [m].
+            Half-widths (3,) of the range of the centre of mass along the box axes [m]. They include
+            displacements that both pads have in common, which shift the centre of mass relative to
+            the pads. Then k cases (k, 4) of the pads' displacements along their tangents, two
+            entries per robot [m].
         """
         normal = self.workcell.contacts[0].T_box_pad[:3, 2]
         across = np.sqrt(np.maximum(1.0 - normal**2, 0.0))

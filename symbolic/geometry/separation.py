@@ -76,10 +76,11 @@ def out_of_reach(
     arms: tuple[ArmGeometry, ArmGeometry],
     tolerance: float,
 ) -> str:
-    """Return the reason to exclude two bodies that no joint positions bring together.
+    """Return the reason to exclude two bodies that no joint positions bring together; '' for other
+    pairs.
 
-    Each moving body is enclosed in the zone that it can reach. If the gap of the zones exceeds the
-    tolerance, the pair is excluded. The result is '' for other pairs.
+    Each moving body is enclosed in a zone that contains all its poses. The pair is excluded if the
+    gap of the zones exceeds the tolerance.
 
     Args:
         a, b: the bodies.

@@ -158,8 +158,8 @@ def _rpy_matrix(rpy: Expression) -> Expression:
 
 
 def rate_matrix(rpy: Expression) -> Expression:
-    """Compute the matrix E (3, 3) from the rates of roll, pitch, yaw to the angular velocity in the
-    world frame: omega = E(rpy) @ rpy_rate.
+    """Compute the matrix E (3, 3) with which the time derivatives of roll, pitch, yaw give the
+    angular velocity in the world frame: omega = E(rpy) @ rpy_rate [rad/s].
 
     Args:
         rpy: (3,) roll, pitch, yaw [rad].

@@ -436,10 +436,8 @@ def check_uncertainty(workcell: Workcell, problems: Problems) -> None:
 
 
 def check_shapes(workcell: Workcell, problems: Problems) -> None:
-    """Record a problem if the cell has more collision shapes than convex pieces are allowed.
-
-    Each shape has at least one piece.
-    """
+    """Record a problem if the cell has more collision shapes than the allowed number of convex
+    pieces; each shape has at least one piece."""
     most = workcell.collision.most_pieces
     if not problems.clean("collision.most_pieces", *_of_robots("urdf")):
         return

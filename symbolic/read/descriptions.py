@@ -400,8 +400,8 @@ def _limit(size: int) -> None:
 
 
 def _refuse_access(event: str, arguments: tuple[Any, ...]) -> None:
-    """Refuse, as an audit hook of Python, every access other than reading files during an
-    expansion.
+    """Refuse every access to the system except reading files, while a xacro file is expanded. The
+    function is an audit hook of Python.
 
     Args:
         event: name of the audit event.

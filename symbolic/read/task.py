@@ -350,12 +350,12 @@ def _choice(
     Args:
         workcell: the workcell.
         i: index of the arm.
-        entries: entries of `task.redundant` in the file.
+        entries: tables of `task.redundant` in the file.
         common: names of joints that move both arms.
 
     Returns:
-        The arm's path along the hand-made trajectory, or None if the file states all joints and
-        positions; the names of the redundant joints.
+        The arm's path along the hand-made trajectory; None if it is not needed, because the file
+        states all joints and positions. Then the names of the redundant joints.
     """
     robot = workcell.robots[i]
     model = arm_model(robot)
