@@ -190,7 +190,8 @@ def _cut(found: re.Match[str]) -> str:
 
 
 def _used(piece: list[str]) -> tuple[set[str], set[str]]:
-    """Return two sets of variables in lines of C: those read before they are set, and those set."""
+    """Return two sets of names of variables in some lines of C: those that are read before they are
+    set, and those that are set."""
     read, written = set[str](), set[str]()
     for line in piece:
         variables = _VARIABLE.findall(line)

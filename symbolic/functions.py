@@ -428,13 +428,11 @@ def _time_share(time: ca.MX) -> ca.MX:
 def arm_functions(model: CellModel) -> dict[str, ca.Function]:
     """Build the functions of a cell that do not depend on collision bodies, by name.
 
-    candidate: evaluator of a whole candidate, see `candidate_function`.
-
-    inverse_dynamics_i, for arm i = 1, 2: joint torques that move the arm without the box, see
-    `symbolic.robot.model`.
-
-    posture: joint positions of both arms at one box pose, see
-    `symbolic.robot.arm.posture_function`.
+    - candidate evaluates a whole candidate (`candidate_function`).
+    - inverse_dynamics_i, for arm i = 1, 2, computes the joint torques that move the arm without the
+      box (`symbolic.robot.model.RobotModel.inverse_dynamics`).
+    - posture computes the joint positions of both arms at one box pose
+      (`symbolic.robot.arm.posture_function`).
     """
     return {
         "candidate": candidate_function(model),
@@ -444,8 +442,8 @@ def arm_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def cell_functions(model: CellModel) -> dict[str, ca.Function]:
-    """Build all compiled functions of a cell, by name: `arm_functions`, and the functions of
-    `symbolic.geometry.clearance.screening_functions` for the distances of bodies."""
+    """Build all compiled functions of a cell, by name: those of `arm_functions`, and those of
+    `symbolic.geometry.clearance.screening_functions`, which bound the distances of bodies."""
     return arm_functions(model) | model.screening
 
 
@@ -475,10 +473,9 @@ def branch_functions(model: CellModel) -> dict[str, ca.Function]:
 def kernel_functions(model: CellModel) -> dict[str, ca.Function]:
     """Build the functions from which compiled code composes the evaluation of a candidate, by name.
 
-    path, start, predict, sample, and in some cells forces: see `sample_functions`.
-
-    clearance, far_clearance, piece_poses: distances and places of bodies, see
-    `symbolic.geometry.clearance.screening_functions`.
+    These are all functions of `sample_functions` (path, start, predict, sample and, in some cells,
+    forces), and clearance, far_clearance and piece_poses of
+    `symbolic.geometry.clearance.screening_functions`, the distances and poses of bodies.
     """
     motions = [f"{block}motion" for block in model.geometry.blocks]
     screening = {name: f for name, f in model.screening.items() if name not in motions}
@@ -488,10 +485,12 @@ def kernel_functions(model: CellModel) -> dict[str, ca.Function]:
 def timing_functions(model: CellModel, samples: int) -> dict[str, ca.Function]:
     """Build the functions for the timing of paths in one workcell, by name.
 
-    path_motion: geometry of a path at uniform samples (`symbolic.path_motion`). load,
-    uncertain_load: contact forces (`symbolic.contact.load`). path_force: normal forces and their
-    derivatives (`symbolic.limit_coefficients.path_force_function`). arm_1, arm_2: derivatives of an
-    arm's motion (`symbolic.path_motion.arm_derivative_function`).
+    - path_motion computes the geometry of a path at uniform samples (`symbolic.path_motion`).
+    - load and uncertain_load compute contact forces (`symbolic.contact.load`).
+    - path_force computes normal forces and their derivatives by the timing
+      (`symbolic.limit_coefficients.path_force_function`).
+    - arm_1 and arm_2 compute joint derivatives and torques of an arm along a path
+      (`symbolic.path_motion.arm_derivative_function`).
 
     Args:
         model: the cell.

@@ -248,8 +248,15 @@ def _pairs(cell: Cell, listed: bool) -> ProgramResult:
 
 
 def _optimum(cell: Cell, progress: Progress) -> Optimum:
-    """Polish the hand-made trajectory briefly. Return the result and the bounds that its solutions
-    lie on."""
+    """Polish the hand-made trajectory of a cell briefly, to find which bounds hold it back.
+
+    Args:
+        cell: the cell.
+        progress: receives messages on the progress.
+
+    Returns:
+        The result of the polish, and the bounds on which its solutions lie.
+    """
     verdicts = cell.evaluate(cell.initial)
     if not verdicts.feasible.all():
         return Optimum(0, (), "the hand-made trajectory, its start, is infeasible")

@@ -331,7 +331,7 @@ Numbered = tuple[MeshGroup, list[int]]
 def page_document(
     data: ReportData, workers: Workers | None = None, paper: bool = True
 ) -> dict[str, Any]:
-    """Return all data of the page as JSON values.
+    """Return the data of the page's scripts as JSON values: cells, trajectories and plots.
 
     Args:
         data: what the report shows.

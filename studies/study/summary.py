@@ -590,8 +590,8 @@ def _store_selected(
 
 
 def _store(folder: CampaignFolder, path: Path, carry: Carry, provenance: Mapping[str, Any]) -> str:
-    """Write the trajectory file of an evaluated carry, with JSON values on its origin. Return its
-    path relative to the results folder."""
+    """Write the trajectory file of an evaluated carry to the path `path` in `folder`. `provenance`
+    has JSON values on its origin. Return its path relative to the results folder."""
     with storing(path):
         path.parent.mkdir(parents=True, exist_ok=True)
     # An infeasible one may be without some of its figures.

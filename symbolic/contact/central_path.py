@@ -574,7 +574,8 @@ def _sx_inputs(program: ConvexProgram) -> list[ca.SX]:
 
 
 def wrenches_of(program: ConvexProgram, owns: list[AnyExpression]) -> list[AnyExpression]:
-    """Select the scaled wrench (wrench_size,) of each patch from the states or iterates `owns`."""
+    """Select the scaled wrench (wrench_size,) of each patch of a convex program from the patches'
+    states or iterates `owns`."""
     return [own[: patch.wrench_size] for patch, own in zip(program.patches, owns, strict=True)]
 
 

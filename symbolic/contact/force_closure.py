@@ -160,8 +160,8 @@ def balance_maps(workcell: Workcell, in_units: bool = False) -> list[Array]:
 
 
 def _balanced_states(workcell: Workcell, share: float) -> tuple[Array, ...] | None:
-    """Find one scaled state (4,) per pad such that the wrenches of all pads sum to zero; None if
-    there are no such states.
+    """Find a scaled state (4,) of each of a workcell's pads such that the wrenches of all pads sum
+    to zero; None if there are no such states.
 
     Each state lies within the pad's friction cone for `share` times the friction coefficient.
     """

@@ -321,7 +321,8 @@ class HoldingHands(ContactModel):
         return uncertainty.centre_of_mass + off, np.zeros((1, 4))
 
     def leading_excess(self, load: ContactLoad, opposed: Expression) -> Expression:
-        """Return zero for any load: the hands of both arms have one common force limit."""
+        """Return zero for any load and any force `opposed` between the arms: the hands of both arms
+        have one common force limit."""
         return ca.SX(0.0)
 
     def commanded_forces(

@@ -161,7 +161,7 @@ def _check_body(seen: CacheKey) -> None:
 
 
 def arm_geometry(workcell: Workcell, i: int) -> ArmGeometry:
-    """Compute frames, axes and limits of the joints of the arm with index i (0 or 1)."""
+    """Compute frames, axes and limits of the joints of a workcell's arm with index i (0 or 1)."""
     robot, contact = workcell.robots[i], workcell.contacts[i]
     model = arm_model(robot)
     data = model.createData()

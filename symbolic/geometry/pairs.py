@@ -107,9 +107,10 @@ class CellGeometry:
 
     @cached_property
     def blocks(self) -> Mapping[str, range]:
-        """Ranges of the possible pairs whose bounds one compiled function computes.
+        """Ranges of indices of the possible pairs; one compiled function bounds the distances of a
+        range.
 
-        The key is the prefix of the function's name: '' for near pairs, `FAR` for the others.
+        The key is the prefix of the function's name: '' for near pairs, `FAR` for all other pairs.
         """
         far = range(self.near, len(self.possible))
         return {"": range(self.near)} | ({FAR: far} if far else {})
@@ -437,14 +438,17 @@ def _always_touching(
 def ignored_pairs(
     workcell: Workcell, bodies: Sequence[CollisionBody]
 ) -> Mapping[frozenset[str], str]:
-    """Return the reason of every pair that the workcell file or an SRDF ignores.
+    """Return the pairs of bodies that the workcell file or an SRDF ignores, each with the reason.
 
-    The key is the set of both bodies' names. The workcell file has precedence over an SRDF. A link
-    without collision shape in an SRDF has no effect.
+    The workcell file has precedence over an SRDF. A link without collision shape in an SRDF has no
+    effect.
 
     Args:
         workcell: the workcell.
         bodies: all collision bodies.
+
+    Returns:
+        The reason as text, by the set of both bodies' names.
 
     Raises:
         CollisionModelError: a name or pattern of `collision.ignored` matches no body.

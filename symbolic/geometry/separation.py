@@ -50,10 +50,8 @@ def _anchored(seen: CacheKey) -> CollisionBody:
 
 
 def moving_arms(a: CollisionBody, b: CollisionBody) -> tuple[int, ...]:
-    """Return the indices of the arms, 0 or 1, that may move bodies a and b relative to each other.
-
-    If one of them is the payload, these are both arms.
-    """
+    """Return the indices of the arms, 0 or 1, that may move bodies a and b relative to each other;
+    both arms if a or b is the payload."""
     if "box" in (a.frame.kind, b.frame.kind):
         return (0, 1)
     return tuple(robot for robot in (0, 1) if robot in (a.frame.robot, b.frame.robot))
@@ -62,9 +60,14 @@ def moving_arms(a: CollisionBody, b: CollisionBody) -> tuple[int, ...]:
 def sorted_by_joint(
     a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry], robot: int
 ) -> tuple[CollisionBody, CollisionBody]:
-    """Return both bodies, the one with the earlier joint first.
+    """Return two bodies in the order of the joints that carry them, the earlier joint first.
 
-    A held box counts as fixed to the last joint of arm `robot` (`anchor`).
+    A held box counts as fixed to the last joint of an arm (`anchor`).
+
+    Args:
+        a, b: the bodies.
+        arms: joints of both arms.
+        robot: index of the arm.
     """
     left, right = anchor(a, arms, robot), anchor(b, arms, robot)
     return (left, right) if left.frame.joint <= right.frame.joint else (right, left)

@@ -432,8 +432,8 @@ def one_machine(robots: Arms) -> bool:
 
 
 def arm_links(robots: Arms, i: int) -> ArmLinks:
-    """Return the links that are modelled as bodies of arm i (0 or 1); the arms may share a
-    machine."""
+    """Return the links that are modelled as bodies of arm i (0 or 1) of two robots, which may be
+    one machine."""
     carried = _carriers(robots[i])
     still = [link for link in carried if carried[link] == UNMOVED]
     moved = [link for link in carried if carried[link] != UNMOVED]

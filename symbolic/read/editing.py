@@ -210,7 +210,8 @@ def _last_body(place: Any) -> list[Any]:
 
 
 def _item(value: Any) -> Any:
-    """Convert a value to a tomlkit item: tables with headings, one row of numbers per line."""
+    """Convert a value to a tomlkit item, such that tables get headings and an array of arrays has
+    one row per line."""
     if isinstance(value, Mapping):
         table = tomlkit.table()
         for key, entry in value.items():

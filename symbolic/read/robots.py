@@ -161,11 +161,15 @@ def _warn_unjudged(robot: str) -> None:
 
 
 def _read_limits(table: TableReader, model: pin.Model | None) -> dict[str, Array | None]:
-    """Read the limits (n,) of n joints by key, from the file, else from the robot's description.
+    """Read the limits of an arm's n joints: from the file, else from the robot's description.
 
     Args:
         table: the arm's section of the workcell file.
         model: model of the arm; None after problems.
+
+    Returns:
+        Arrays (n,) by the names of the keys, which are attributes of `symbolic.records.Robot`; None
+        for a limit on jerk that is not stated.
     """
     n, found = FOLLOWING if model is None else model.nq, dict[str, Array | None]()
     for key, (own, allowed) in LIMIT_KEYS.items():

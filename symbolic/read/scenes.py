@@ -188,7 +188,7 @@ class _Sdf:
 
         Args:
             placed: name of a frame, and the pose (4, 4) of the model's placement frame in it.
-            by: the element that states the placement frame.
+            by: the element that states the name of the model's placement frame.
         """
         base, pose = placed
         frame = by.raw("placement_frame") or by.inner_text("placement_frame")
@@ -366,9 +366,8 @@ def _read_moveit(path: Path, found: SceneBuilder) -> None:
 def _object(
     table: TableReader, frames: Mapping[str, Array], path: Path, found: SceneBuilder
 ) -> None:
-    """Add one collision object of a planning scene, its primitives, meshes and planes, to `found`.
-
-    The poses (4, 4) in `frames` are those of named frames in the world.
+    """Add a collision object of a planning scene, from its `table`, to `found`: primitives, meshes,
+    planes. The poses (4, 4) in `frames` are those of named frames in the world; `path` is the file.
     """
     name = str(table.raw("id", "") or "object")
     if table.raw("operation", None) not in _ADDED:
@@ -450,7 +449,8 @@ def _primitive(name: str, kind: str, sizes: Array, pose: Array, found: SceneBuil
 def _moveit_mesh(
     name: str, table: TableReader, pose: Array, path: Path, found: SceneBuilder
 ) -> None:
-    """Add a mesh, at `pose` (4, 4) in the world, that a message states by address or triangles."""
+    """Add a mesh with the pose (4, 4) in the world to `found`. Its `table`, in the file `path`,
+    states an address or triangles."""
     if table.has("resource"):
         scale = table.vector("dimensions", (ANY,) * 3, (1.0, 1.0, 1.0))
         found.mesh(name, str(table.raw("resource")), path, scale, pose)
@@ -470,7 +470,7 @@ def _moveit_mesh(
 
 
 def _triangles(name: str, vertices: Any, faces: Any, pose: Array, found: SceneBuilder) -> None:
-    """Add a mesh, at `pose` (4, 4) in the world, from lists of vertices [m] and of indices."""
+    """Add a mesh, at `pose` (4, 4) in the world, from lists of vertices [m] and vertex indices."""
     try:
         places = np.array(vertices, dtype=float).reshape(-1, 3)
         corners = np.array(faces, dtype=float).reshape(-1, 3)

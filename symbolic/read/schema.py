@@ -222,7 +222,8 @@ def _kind(kind: Any) -> Schema:
 
 
 def _described(record: type, keys: dict[str, Schema]) -> dict[str, Schema]:
-    """Add descriptions to the schemas of a record's fields.
+    """Return the schemas of a record's fields, with the descriptions from the record's docstring
+    added.
 
     Args:
         record: class of the record; the attributes in its docstring are the descriptions.

@@ -54,7 +54,7 @@ FORCE_LIMIT_MARGIN = 1.001
 
 
 def read_task(table: TableReader, holding: Array) -> tuple[Task, tuple[RedundancyEntry, ...]]:
-    """Read the task (fixed poses, waypoints, sampling, limits) and the entries of redundant joints.
+    """Read the task (fixed poses, waypoints, sampling, limits), and the tables of redundant joints.
 
     Args:
         table: the task's section of the workcell file.
@@ -207,8 +207,9 @@ def _waypoints(table: TableReader, names: Sequence[str]) -> list[Waypoint]:
 
 
 def _read_initial(table: TableReader, free: list[Waypoint], names: Sequence[str]) -> Array:
-    """Read the initial poses (n_free, 6) of the waypoints `free` [m, rad], by default the middle of
-    their bounds. `names` are the names of a pose's six numbers, for messages."""
+    """Read `initial` of the task's table: initial poses (n_free, 6) of the waypoints `free` [m,
+    rad], by default the middle of their bounds. `names` are those of a pose's numbers, for
+    messages."""
     value = table.raw("initial", None)
     path, problems = table.at("initial"), table.problems
     if value is None:

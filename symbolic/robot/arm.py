@@ -516,8 +516,8 @@ def _independent_axes(model: RobotModel) -> tuple[int, ...]:
 
 
 def following_columns(model: RobotModel, jacobian: ca.SX) -> ca.SX:
-    """Return the columns (6, 6) of a Jacobian (6, n) for the six joints of the model that follow
-    the box."""
+    """Return those columns (6, 6) of an arm's Jacobian `jacobian` (6, n) that belong to the six
+    joints which follow the box."""
     return jacobian[:, list(model.following)] if model.redundant else jacobian
 
 
