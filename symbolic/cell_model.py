@@ -174,10 +174,12 @@ def own_pairs(geometry: CellGeometry, arm: int) -> list[int]:
 
 
 def own_clearance(geometry: CellGeometry, arm: int, bounds: Bounds) -> Clearance:
-    """Return a function of the clearance of one arm from everything except the other arm.
+    """Return a function that bounds how close one arm comes to any body except those of the other
+    arm.
 
-    The function takes the box poses (n, 6) and the arm's joint positions (n, joints) at n samples.
-    It returns the least lower bound of a distance over all samples [m], infinity without pairs.
+    The function takes box poses (n, 6) and the arm's joint positions (n, joints) at n samples. It
+    returns the smallest lower bound of a distance over all samples [m]; infinity if no pairs are
+    checked.
 
     Args:
         geometry: the collision bodies and pairs.

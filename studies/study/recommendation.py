@@ -362,10 +362,11 @@ def _force_table(
     found: Recommendation,
     advance: Advance,
 ) -> ForceTable:
-    """Compute the table of shortest durations [s]: a row per path, a column per commanded force.
+    """Compute the table of shortest durations [s] with a row per path and a column per commanded
+    force.
 
-    The forces are the results of `table_forces` and the force of the recommended carry. The rows
-    are the hand-made path, the recommended path, further paths, and the best of the front at each
+    The forces are those of `table_forces` and the force of the recommended carry. The rows are the
+    hand-made path, the recommended path, further paths, and the best path of the front at each
     force.
 
     Args:

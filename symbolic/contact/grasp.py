@@ -198,8 +198,8 @@ class Grasp:
         return [c + press * s for c, s in zip(chosen, given, strict=True)], share
 
     def _squeeze_scale(self, given: list[ca.SX], asked: list[ca.SX]) -> ca.SX:
-        """Compute a factor on the internal squeeze with which given states plus the squeeze lie
-        within the friction cones.
+        """Compute a factor on the internal squeeze. With this multiple of the squeeze added, the
+        states of all pads lie within their friction cones.
 
         Args:
             given: state (4,) of each pad in the internal squeeze.

@@ -69,8 +69,8 @@ class SoftGrasp:
         return ca.Function("held_first", inputs, outputs, names, ["normal", "slope", "state"])
 
     def solve(self, load: ca.MX, handed: dict[str, ca.MX]) -> ca.MX:
-        """Build the expression of the states (size,) of all patches that balance a load at least
-        effort.
+        """Build the expression of those states (size,) of all patches that balance a load with the
+        least effort.
 
         Args:
             load: (6,) force and moment about the box frame's origin, along the box's axes [N, N m].

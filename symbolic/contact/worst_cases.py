@@ -102,8 +102,8 @@ def case_squeeze_function(
 def case_gradient_function(
     workcell: Workcell, commanded: int = 1, numbers: bool = False
 ) -> ca.Function:
-    """Build the function of the least commanded normal forces in one case, with derivatives by the
-    motion.
+    """Build the function of the least commanded normal forces in one case of an uncertainty, with
+    derivatives by the motion.
 
     Inputs and the output normal_force (2,) are those of `case_squeeze_function`. The output slope
     (NumPy shape (2, 18)) has the derivatives of each force by pose, rate and second_rate. For two
@@ -137,8 +137,8 @@ def case_gradient_function(
 
 
 def case_slopes_function(workcell: Workcell) -> ca.Function:
-    """Build the function of the least commanded normal forces in one case along a path, with
-    derivatives by path and timing. The case must not displace the pads.
+    """Build the function of the least commanded normal forces in one case of an uncertainty along a
+    path, with derivatives by path and timing. The case must not displace the pads.
 
     Inputs: pose, first, second (6,), the box pose and its first and second derivative by u; a =
     u''; w = u'^2; case (18,), laid out by `CASE_SIZES`; then symbolic parameters. Outputs:
@@ -177,12 +177,15 @@ def case_excess_function(workcell: Workcell) -> ca.Function:
 
 
 def case_slack_function(workcell: Workcell, commanded: int = 1) -> ca.Function:
-    """Build a fast, sufficient test that a commanded force holds the payload in one case.
+    """Build a fast, sufficient test that a commanded force holds the payload in one case of an
+    uncertainty.
+
+    A positive result proves that the force holds the payload; otherwise only
+    `case_squeeze_function` decides. The test takes a thirtieth of the time of that function.
 
     Inputs: pose, rate, second_rate (6,), the box pose and its time derivatives; case (18,), laid
     out by `CASE_SIZES`; force, the commanded normal force [N]; then symbolic parameters. Output:
-    slack. If slack is positive, the force holds the payload; if not, only `case_squeeze_function`
-    decides. The test takes a thirtieth of the time of `case_squeeze_function`.
+    slack, a scalar.
 
     Args:
         workcell: the workcell.
@@ -288,8 +291,8 @@ def case_parts(case: ca.SX | ca.MX) -> list[ca.SX | ca.MX]:
 
 
 def case_contact_load(workcell: Workcell, inputs: Mapping[str, Expression]) -> ContactLoad:
-    """Compute the load on the contacts in one case: force and moment about the nominal centre of
-    mass, along the axes of contact 1.
+    """Compute the load on the contacts in one case of an uncertainty: force and moment about the
+    nominal centre of mass, along the axes of contact 1.
 
     Args:
         workcell: the workcell.
@@ -313,7 +316,8 @@ def case_contact_load(workcell: Workcell, inputs: Mapping[str, Expression]) -> C
 
 
 def case_load_function(workcell: Workcell) -> ca.Function:
-    """Build the function of the force and moment that the motion requires in one case.
+    """Build the function of the force and moment that the box motion requires in one case of an
+    uncertainty.
 
     Inputs: pose, rate, second_rate (6,), the box pose and its time derivatives; case (18,), laid
     out by `CASE_SIZES`; then the payload's symbolic parameters. Outputs: force (3,) [N] and moment
@@ -377,7 +381,7 @@ def _sizes_function(squeeze: GraspSqueeze) -> ca.Function:
 
 
 def case_origin_load_function(workcell: Workcell) -> ca.Function:
-    """Build the function of the load that the pads have to balance in one case.
+    """Build the function of the load that the pads have to balance in one case of an uncertainty.
 
     Inputs: pose, rate, second_rate (6,), the box pose and its time derivatives; case (18,), laid
     out by `CASE_SIZES`; then the payload's symbolic parameters. Output: force and moment (6,) about

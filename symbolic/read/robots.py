@@ -375,7 +375,8 @@ def _read_folders(table: TableReader, folder: Path) -> tuple[Path, ...]:
 def _read_described(
     table: TableReader, key: str, folder: Path, package_dirs: tuple[Path, ...]
 ) -> Path:
-    """Read the path of a robot's file at a key: a relative path, or an address package://NAME/...
+    """Read the path of a robot's file, which the value of a key states as a relative path or as an
+    address package://NAME/...
 
     Args:
         table: the arm's section of the workcell file.

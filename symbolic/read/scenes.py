@@ -223,9 +223,9 @@ class _Sdf:
             self._place(scope, wanted or name, inner, placed, by)
 
     def _pose(self, part: ElementReader) -> tuple[str, Array]:
-        """Read the name of the frame to which an element's pose is relative, and the pose (4, 4).
+        """Read an element's pose (4, 4), and the name of the frame to which it is relative.
 
-        The name is '' for the default frame.
+        The name comes first; it is '' for the default frame.
         """
         pose = part.child("pose")
         if pose is None:
