@@ -171,7 +171,7 @@ def _postures(cell: Cell) -> ProgramResult:
 
 
 def _candidates(cell: Cell, count: int, seed: int) -> Iterator[ProgramResult]:
-    """Evaluate random candidates. Yield how many are feasible, then what makes the others
+    """Evaluate random candidates. Yield how many are feasible, then why the infeasible ones are
     infeasible.
 
     Args:

@@ -175,8 +175,8 @@ class StoredRecommendation:
 
     @property
     def limited_force(self) -> Array:
-        """(2,) largest normal force of each robot, of the kind to which the force limit applies
-        [N]."""
+        """(2,) largest normal force of each robot [N]: planned or robust forces, whichever the
+        force limit applies to."""
         return self.peak_force if self.robust_force is None else self.robust_force
 
 

@@ -400,9 +400,9 @@ def carry_entry(carry: Carry, evaluation: int, file: str | None) -> SelectedEntr
     """Return the summary's record of an evaluated carry.
 
     Args:
-        evaluation: number of the candidate in the order of evaluation, from 1; 0 for the hand-made
-            one.
-        file: path of its trajectory file, relative to the results folder.
+        carry: the carry.
+        evaluation: number of the candidate among all evaluated, from 1; 0 for the hand-made one.
+        file: path of the carry's trajectory file, relative to the results folder.
     """
     assert carry.judgement is not None, "selected carries are judged"
     return SelectedEntry(

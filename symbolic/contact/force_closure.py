@@ -118,12 +118,12 @@ def has_force_closure(workcell: Workcell) -> bool:
 
 
 def equal_pressure_rows(workcell: Workcell) -> Array:
-    """Return the conditions for equal pressure as a matrix (k, pads). Its product with the pads'
+    """Return the conditions for equal pressure as a matrix (k, pads), whose product with the pads'
     normal forces is zero.
 
-    Each row states that two pads of one arm with the same normal press with equal pressure, because
-    the arm keeps the orientation of their common plane. Pads with different normals press as the
-    motion requires.
+    Each row states that two pads press with equal pressure. These are pads of one arm with the same
+    normal, because the arm keeps the orientation of their common plane. Pads with different normals
+    press as the motion requires.
     """
     pads, robots, rows = workcell.pads, workcell.pad_robots, []
     for k in range(1, len(pads)):
@@ -242,8 +242,8 @@ def scaled_patch(contact: Contact) -> SoftPatch:
 
 
 def _generators(contact: Contact) -> Array:
-    """Return n scaled states (n, 4) with N = 1 on the boundary of a patch's friction cone; their
-    positive sums approximate the cone."""
+    """Return n scaled states (n, 4) on the boundary of a patch's friction cone, all with normal
+    force 1. Their sums with positive weights approximate the cone."""
     patch, rows = scaled_patch(contact), []
     for angle in 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
         for share in np.linspace(0.0, 1.0, TORSIONS + 1)[:-1]:

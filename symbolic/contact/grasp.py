@@ -266,7 +266,7 @@ class Grasp:
     @property
     def normals(self) -> ca.SX:
         """Sum of the normal forces of each robot (2,) in the internal squeeze, as an expression.
-        The normal forces of both robots sum to one."""
+        The two sums add up to one."""
         squeeze, found = number(self.numbers.squeeze), ca.SX(2, 1)
         for at, robot in zip(self._ends, self.robots, strict=False):
             found[robot] += squeeze[at]

@@ -129,7 +129,7 @@ def internal_force_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Arra
     The push results from an error of the arms' relative pose; the elastic layers of the two arms
     are springs in series. Let f be the unit vector of the push, n . f the normal force that it adds
     at a hand, and g(f) its tilting or its sliding over the friction coefficient, as a force. The
-    hand then needs g(f) - n . f more. The square of this is at most max(g)^2 + 2 g(n) + |n|^2 for
+    hand then needs g(f) - n . f more. The square of this is at most max(g)^2 + 2 g(n) + n . n for
     any direction f.
 
     Args:
@@ -166,16 +166,17 @@ def internal_force_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Arra
 
 
 def _most_sliding(along: Array, torsion: Array, kappa: float) -> float:
-    """Compute an upper bound of |T f|^2 + (s . f)^2 + kappa |T f| |s . f| over all unit vectors f
-    (3,).
+    """Compute an upper bound of t^2 + s^2 + kappa t s over all unit vectors f (3,), where t is the
+    length of `along` f, and s the absolute scalar product of `torsion` and f.
 
-    For every q > 0 the product |T f| |s . f| is at most half of q |T f|^2 + (s . f)^2 / q. The
-    result is the least bound over several q.
+    For every q > 0 the product t s is at most half of q t^2 + s^2 / q. The result is the least
+    bound over several q.
 
     Args:
-        along: (2, 3) matrix T.
-        torsion: (3,) vector s.
-        kappa: the factor kappa.
+        along: (2, 3) tangential force per unit of f.
+        torsion: (3,) torsion over the mean distance of the patch's points from its centre, per unit
+            of f.
+        kappa: coefficient of the patch.
     """
     first, second = along.T @ along, np.outer(torsion, torsion)
     bounds = (

@@ -320,9 +320,8 @@ class ContactModel(ABC):
         return planned + np.multiply.outer(extra, self.internal_force_ratio(leader))
 
     def displacement_margin(self, uncertainty: Uncertainty) -> float:
-        """Return the distance by which the pads' displacements may still grow until forces can no
-        longer be computed [m]; zero or negative if the uncertainty already allows larger
-        displacements."""
+        """Return how much farther the pads may be displaced than the uncertainty says until forces
+        can no longer be computed [m]. Zero or negative if the uncertainty goes too far already."""
         return np.inf
 
     # --- jobs ---

@@ -141,9 +141,8 @@ class SoftFingerGrasp(SoftFinger):
         return uncertainty.centre_of_mass, np.array([off * np.array(at) for at in signs])
 
     def displacement_margin(self, uncertainty: Uncertainty) -> float:
-        """Return the distance by which the pads' displacements may still grow until forces can no
-        longer be computed [m]; zero or negative if the uncertainty already allows larger
-        displacements."""
+        """Return how much farther the pads may be displaced than the uncertainty says until forces
+        can no longer be computed [m]. Zero or negative if the uncertainty goes too far already."""
         off = uncertainty.pad_position + uncertainty.apart / 2.0
         return LARGEST_DISPLACEMENT * least_distance(self.workcell) - off
 

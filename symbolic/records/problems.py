@@ -45,7 +45,7 @@ class Problems:
     """True if unknown keys are no problem."""
 
     def add(self, path: str, text: str) -> None:
-        """Record a problem; after `MOST_PROBLEMS` problems only count it.
+        """Record a problem, or only count it if `MOST_PROBLEMS` problems are recorded already.
 
         Args:
             path: key path of the wrong value.
