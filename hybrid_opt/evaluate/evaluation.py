@@ -314,10 +314,14 @@ class CandidateEvaluator:
         return found
 
     def _paths(self, x: Array) -> list[SampledPath | None]:
-        """Return the sampled path of each decision vector, in order; None if an arm loses the path.
+        """Compute the joint positions at all samples for n decision vectors.
 
         Args:
             x: (n, n_var) decision vectors.
+
+        Returns:
+            One sampled path for each decision vector, in order; None where an arm cannot follow the
+            box.
         """
         if self._kernel is None:
             outputs: Mapping[str, Array] = self.outputs(x)
@@ -365,14 +369,16 @@ class CandidateEvaluator:
         )
 
     def _failures_between_samples(self, x: Array) -> list[float | None]:
-        """Return the path parameter at which the proof of each carry fails; None for a carry with
-        proof.
+        """Try to prove that each carry is free of collisions between its samples.
 
-        The proof shows that the carry is free of collisions between its samples. Results are cached
-        by path, since several carries may differ only in their force limit.
+        Proofs are cached by path, since several carries may differ only in their force limit.
 
         Args:
             x: (n, n_var) decision vectors.
+
+        Returns:
+            For each decision vector the path parameter u in [0, 1] at which the proof fails; None
+            if it succeeds.
         """
         paths = np.ascontiguousarray(x[:, : self.workcell.task.n_path])
         keys = [path.tobytes() for path in paths]
@@ -457,12 +463,13 @@ class CandidateEvaluator:
 
 
 def _failure(certificate: Certificate | None) -> float | None:
-    """Return the path parameter at which a certificate fails; None for a path that is proven free.
-
-    The result is 0 if an arm loses the path.
+    """Return the path parameter u in [0, 1] at which a certificate fails.
 
     Args:
         certificate: the certificate; None if an arm loses the path on a sample.
+
+    Returns:
+        The path parameter; 0 if an arm loses the path; None for a path that is proven free.
     """
     if certificate is not None and certificate.is_free:
         return None
@@ -470,12 +477,13 @@ def _failure(certificate: Certificate | None) -> float | None:
 
 
 def _needs(objectives: Sequence[Objective]) -> tuple[str, ...] | None:
-    """Return the names of the per-sample outputs that objectives need from the compiled kernel.
-
-    The result is None if an objective needs an output that the kernel lacks.
+    """Return the names of the per-sample outputs of the compiled kernel that objectives read.
 
     Args:
         objectives: the objectives.
+
+    Returns:
+        Names of outputs; None if an objective reads an output that the kernel lacks.
     """
     wanted: set[str] = set()
     for objective in objectives:
@@ -493,11 +501,11 @@ class LockedEvaluator:
     """
 
     def __init__(self, evaluator: CandidateEvaluator, positions: Array) -> None:
-        """Lock the redundant joints.
+        """Fix the redundant joints at the same positions along the whole path.
 
         Args:
             evaluator: evaluator of a cell in which redundant joints are free at all waypoints.
-            positions: (m,) positions of the redundant joints [rad or m].
+            positions: (m,) positions of the m redundant joints [rad or m].
 
         Raises:
             SettingsError: a redundant joint is fixed at a waypoint, or the number of positions is

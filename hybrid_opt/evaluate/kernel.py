@@ -357,7 +357,8 @@ def _same(found: SampledVerdicts, expected: SampledVerdicts) -> bool:
 
 
 def _definitions(geometry: CellGeometry) -> str:
-    """Return the C definitions of the sizes for which kernel.c is compiled."""
+    """Return C macro definitions of the numbers of samples, joints and bodies, for which kernel.c
+    is compiled."""
     workcell = geometry.workcell
     sizes = sample_sizes(workcell)
     ends = np.cumsum(list(sizes.values()))
@@ -420,7 +421,8 @@ def _groups(compiled: CompiledCell) -> list[str]:
 
 
 def _given(compiled: CompiledCell) -> str:
-    """Return the C macros of kernel.c that locate each function's parameters among all groups."""
+    """Return C macros for kernel.c that say where each function's parameters stand in the array of
+    all parameters of the cell."""
     numbers, groups = compiled.numbers, _groups(compiled)
     sizes = [numbers.sizes[name] for name in groups]
     at = dict(zip(groups, np.cumsum([0, *sizes]).tolist(), strict=False))
@@ -483,9 +485,16 @@ class BatchData(ctypes.Structure):
 
 
 def _judge_data(checker: CollisionChecker) -> tuple[JudgeData, dict[str, NDArray[Any]]]:
-    """Return the pairs of bodies and the margins of a cell as the kernel's C structure, and by name
-    the arrays to which its pointers refer. These arrays and the checker must stay alive as long as
-    the kernel.
+    """Describe the pairs of bodies of a cell, and their margins, to the compiled kernel.
+
+    The returned arrays and the checker must stay alive as long as the kernel, since the C structure
+    holds pointers to them.
+
+    Args:
+        checker: collision checker of the cell.
+
+    Returns:
+        The C structure, and by name the arrays to which its pointers refer.
     """
     geometry = checker.geometry
     tables = np.zeros(len(geometry.active), dtype=_TABLE)

@@ -157,8 +157,8 @@ def _peak_torque_use(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _force_imbalance(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute for n candidates the largest difference of both normal forces over the mean reference
-    force, (n,).
+    """Compute for n candidates the largest difference between the two normal forces, over the mean
+    reference force, (n,).
 
     Args:
         outputs: outputs of the evaluator by name.

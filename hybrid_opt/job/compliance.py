@@ -229,7 +229,7 @@ def require_skew(job: Job, delay: float, stiffness: float) -> None:
 
 
 def _displacement(job: Job, phase: Phase, late: int, delay: float) -> tuple[Array, Array, Array]:
-    """Compute how a delay displaces the pad of the late arm in a phase.
+    """Compute how the pad of an arm is displaced from its planned place if that arm is late.
 
     Args:
         job: the whole job.
@@ -238,8 +238,9 @@ def _displacement(job: Job, phase: Phase, late: int, delay: float) -> tuple[Arra
         delay: time by which the arm is late [s].
 
     Returns:
-        Mask of the phase's samples, False where a time is repeated; displacement (n, 3) [m] and
-        contact normal (n, 3) at the n samples with True, world frame.
+        - Mask (m,) of the m samples of the phase, False where a time is repeated.
+        - Displacement (n, 3) [m] of the late pad at the n samples with True, world frame.
+        - Contact normal (n, 3) at these samples, world frame.
     """
     motion, contact = phase.motion, job.workcell.contacts[late]
     keep = np.concatenate([[True], np.diff(motion.time) > 0.0])

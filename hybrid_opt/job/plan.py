@@ -424,12 +424,17 @@ class JobModel:
     def _around(
         self, carry: Carry, handling: Handling
     ) -> tuple[StraightMotions, list[Phase], list[Phase]]:
-        """Plan the straight motions before and after a carry, with the heights, speeds and
-        stand-off of `handling`, and time them.
+        """Plan and time the straight motions before and after a carry.
+
+        Results are cached for carries with the same ends.
+
+        Args:
+            carry: the carry.
+            handling: heights, speeds and stand-off of the motions.
 
         Returns:
-            Straight motions, their phases before the carry, and their phases after it; each list
-            begins next to the carry. Results are cached for carries with the same ends.
+            The straight motions, their phases before the carry, and their phases after it. Each
+            list starts with the phase next to the carry.
         """
         pose, q = carry.pose[[0, -1]], carry.q[[0, -1]].round(_SAME_POSTURE)
         key = handling, pose.tobytes() + q.tobytes()
@@ -470,10 +475,10 @@ class JobModel:
     def _phases(
         self, drafts: Sequence[Phase], timing: Timing, jerk: JerkLimits | None
     ) -> Iterator[Phase]:
-        """Yield the phases in order of time, each with its beginning and the use of its limits.
+        """Yield the phases in order of time, with their start times and with the use of each limit.
 
         Args:
-            drafts: phases in order of time.
+            drafts: phases in order of time, without start times.
             timing: timing of the carry.
             jerk: limits on jerk; None for no such limits.
 

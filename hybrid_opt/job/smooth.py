@@ -134,7 +134,7 @@ def driven_timing(model: TimingModel, x: Array) -> Timing:
 
 
 def _smoothed(model: TimingModel, timing: Timing, width: float) -> Timing:
-    """Average a timing over a window, and slow it down until it satisfies its limits.
+    """Average a timing over a window of time, then slow it down until it satisfies its limits.
 
     Args:
         model: timing model of the workcell.

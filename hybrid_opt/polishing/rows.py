@@ -279,12 +279,18 @@ class ConstraintRows:
         }
 
     def _lay_out_places(self, layout: RowLayout, q: tuple[Array, Array]) -> dict[str, Any]:
-        """Return the arguments of `rows.cpp` by name for place rows, grouped by their functions.
+        """Build the arguments of the C++ class `Rows` (rows.cpp) that describe the place rows.
+
+        Rows with the same compiled function form a group. Joint positions are solved for once per
+        place, also if several rows need them.
 
         Args:
             layout: order of the rows.
-            q: (m, n) for each arm, joint positions at all places near those that hold the box
-                [rad]. The joints of each place are solved for once.
+            q: joint positions of each arm, (m, n) for m places and n joints [rad]. They are close
+                to the positions that hold the box.
+
+        Returns:
+            Arguments by the names that rows.cpp gives them.
         """
         cell, rows = self._cell, layout.place_rows
         members: dict[NumericFunction, list[int]] = {}

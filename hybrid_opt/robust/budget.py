@@ -266,12 +266,12 @@ def reserve(model: RobustModel, motion: HeldMotion, required: Array, allowed: Ar
 
 
 def _last_factor(excess: Callable[[float], float], near: float, far: float) -> float:
-    """Find the factor closest to `far` at which a function is not positive.
+    """Find the factor closest to `far` at which a function is zero or negative.
 
     Args:
         excess: function of the factor.
-        near: begin of the considered range of factors.
-        far: end of this range.
+        near: start of the searched range of factors.
+        far: end of this range, larger or smaller than `near`.
 
     Returns:
         The factor; NaN if the function is positive at `near`.
@@ -287,11 +287,11 @@ def _last_factor(excess: Callable[[float], float], near: float, far: float) -> f
 def _excess(
     model: RobustModel, motion: HeldMotion, required: Array, allowed: Array
 ) -> Callable[[Workcell], float]:
-    """Return a function that maps a changed cell to the largest ratio of a required force to the
-    reference force, minus one.
+    """Return a function of a changed cell that tells whether its forces fit the reference forces.
 
-    The required forces of the changed cell are its robust forces along the motion, scaled by the
-    ratio of `required` to the robust forces of the unchanged cell.
+    The function returns the largest ratio of a required force to the reference force, minus one.
+    The required forces of a changed cell are `required` times the ratio of its robust forces to
+    those of the unchanged cell.
 
     Args:
         model: computes robust forces of the unchanged cell.
@@ -341,11 +341,11 @@ def _of_cell(workcell: Workcell, excess: Callable[[Workcell], float]) -> Iterato
     """Yield the smallest changes of a cell that bring its required forces within the reference
     forces.
 
-    Changed are the mass, the friction, and ranges of the uncertainty, one at a time.
+    Each change concerns one quantity: the mass, the friction, or a range of the uncertainty.
 
     Args:
         workcell: the cell.
-        excess: function of a changed cell from `_excess`, which is zero if the forces just fit.
+        excess: function of a changed cell from `_excess`; zero if the forces just fit.
     """
     payload, contacts, uncertainty = workcell.payload, workcell.contacts, workcell.uncertainty
 
@@ -382,11 +382,11 @@ def _of_cell(workcell: Workcell, excess: Callable[[Workcell], float]) -> Iterato
 
 
 def _smallest_change(excess: Callable[[float], float], far: float) -> float | None:
-    """Find the factor closest to one at which a function is not positive.
+    """Find the factor closest to one at which a function is zero or negative.
 
     Args:
         excess: function of the factor, positive at one.
-        far: other end of the considered range of factors.
+        far: other end of the searched range of factors.
 
     Returns:
         The factor; None if the function is positive at `far`.

@@ -533,16 +533,19 @@ class RobustModel:
         leader: int,
         threads: int = 1,
     ) -> Array:
-        """Compute the ratio (k, n) of the force that each of k cases needs at n samples to the
-        commanded force. Ratios below `screened` are returned as `screened`.
+        """Compute the force that each of k cases needs at n samples, over the commanded force.
 
         Args:
             motion: box motion at n samples.
             force: (n,) commanded normal forces [N].
-            cases: (k, 18) cases, each applied to all samples.
-            screened: least ratio that is computed.
-            leader: index of the leading arm.
+            cases: (k, 18) cases of the uncertainty, each applied to all samples.
+            screened: ratios below this one are not computed exactly; they are returned as
+                `screened`.
+            leader: index of the position-controlled arm.
             threads: number of threads, 0 for one per core.
+
+        Returns:
+            (k, n) ratios; above 1 the commanded force does not hold the box.
         """
         n, k = len(motion.pose), len(cases)
         displaced = bool(cases[:, 11:15].any())
@@ -557,12 +560,13 @@ class RobustModel:
         return share.reshape(k, n)
 
     def _friction_left(self, cases: Array) -> float:
-        """Compute the share of the friction coefficient that displaced pads leave, less a reserve,
-        in the worst of some cases. Forces are scaled by it for `slack`, which ignores
-        displacements.
+        """Compute the least share of the friction coefficient that displaced pads leave in k cases,
+        less a reserve.
+
+        `slack` ignores displacements; forces are scaled by this share to make up for it.
 
         Args:
-            cases: (k, 18) cases.
+            cases: (k, 18) cases of the uncertainty.
         """
         apart = np.linalg.norm(cases[:, 11:13] - cases[:, 13:15], axis=1)
         lost = self._contact.friction_lost(apart) / cases[:, :2].min(axis=1)

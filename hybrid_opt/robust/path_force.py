@@ -304,8 +304,7 @@ class GoverningForce:
         return self._inputs(self._workcell, self._motion, pads=True)
 
     def _inputs(self, cell: Workcell, motion: BoxMotion, pads: bool) -> Array:
-        """Compute the m inputs of `_gradient` in another cell, for each of the k governing cases,
-        which need the largest force.
+        """Compute the m inputs of `_gradient` for another cell.
 
         Args:
             cell: the other cell.
@@ -313,8 +312,9 @@ class GoverningForce:
             pads: True if the other cell's pads differ from this cell's.
 
         Returns:
-            Inputs (k, m). If `pads` is True and the pads' normals are not opposite, the normal
-            forces (k, 1) of the force-controlled arm [N] instead.
+            Inputs (k, m), one row for each of the k cases that need the largest force. If `pads` is
+            True and the pads' normals are not opposite, the normal forces (k, 1) of the
+            force-controlled arm [N] instead.
         """
         cases = worst_cases(command_model(cell), cell.uncertainty, self._leader)
         assert len(cases) == self._count, "no range of the uncertainty begins or ends"
@@ -333,11 +333,12 @@ class GoverningForce:
 
     @cached_property
     def _gradient(self) -> Array:
-        """Gradient (k, 2, m) of the force in each of the k cases that need the largest force, with
-        respect to the m inputs of `_inputs`.
+        """Gradient (k, 2, m) of the commanded force by the m inputs of `_inputs`, in each of k
+        cases.
 
-        The second axis has the gradients with the friction coefficient of robot 0, and of robot 1,
-        slightly lowered: the lower coefficient decides how the force between the arms is shared.
+        These are the cases that need the largest force. The lower of both friction coefficients
+        decides how the arms share the force. So index 0 of the second axis has the gradient with
+        the coefficient of robot 0 slightly lowered, and index 1 with that of robot 1.
         """
         if self._squeezed:
             numbers = WorkcellParameters(self._workcell)

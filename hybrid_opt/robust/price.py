@@ -59,11 +59,16 @@ def robust_price(
     Args:
         model: computes robust forces of the carry's workcell.
         carry: the carry.
-        rng: random generator that draws the cases of the check.
+        rng: random generator for the cases of the check.
         leader: index of the position-controlled arm.
-        cases: number of random cases.
+        cases: number of random cases in which the commanded force is checked.
         threads: number of threads, 0 for one per core.
-        points: number of factors on the uncertainty.
+        points: number of factors, evenly spaced from 0 to `MOST`, by which the uncertainty is
+            multiplied. Factors that leave no friction are left out.
+
+    Returns:
+        Largest normal forces for each factor, the largest factor within the reference forces, and
+        the check of the forces for factor 1.
 
     Raises:
         SettingsError: the uncertainty leaves no friction or contact patch.

@@ -161,8 +161,13 @@ class _JerkProblem:
         return replace(self._checked_timing(c), rounds=rounds)
 
     def _iterate(self, c: Array) -> tuple[Array, int]:
-        """Solve programs from feasible spline coefficients c (k,) until the duration settles.
-        Return the last coefficients (k,) and the number of programs solved.
+        """Solve a sequence of convex programs until the duration settles.
+
+        Args:
+            c: (k,) spline coefficients of the squared speed that satisfy all limits.
+
+        Returns:
+            The last coefficients (k,), and the number of convex programs solved.
         """
         duration = self._coarse.duration(c)
         for rounds in range(1, MAX_JERK_ITERATIONS + 1):
@@ -176,11 +181,14 @@ class _JerkProblem:
         return c, rounds
 
     def _step(self, c: Array) -> Array | None:
-        """Solve one program about spline coefficients c (k,) of the squared speed.
+        """Solve one convex program, linearised at given spline coefficients.
+
+        Args:
+            c: (k,) spline coefficients of the squared speed.
 
         Returns:
             Coefficients (k,) with a shorter duration that satisfy all limits at the coarse points;
-            None if the program has no solution.
+            None if the convex program has no solution.
         """
         at, rows = self._coarse, JerkProgram(len(c))
         self._motion_rows(rows)
@@ -235,10 +243,14 @@ class _JerkProblem:
             _add_linearised(at, c, sign * value[:, near], sign * by, rows)
 
     def _jerk_rows(self, c: Array, rows: JerkProgram) -> None:
-        """Add limits on the jerks of joints and payload to the program `rows`.
+        """Add limits on the jerks of joints and payload to the convex program `rows`.
 
-        The quantity jerk / sqrt(v) is linear in the coefficients, with the squared speed v. It is
-        bounded by the tangent of limit / sqrt(v) at the coefficients c (k,).
+        With the squared speed v, jerk / sqrt(v) is linear in the spline coefficients of v. Its
+        upper bound, limit / sqrt(v), is replaced by the tangent at given coefficients.
+
+        Args:
+            c: (k,) spline coefficients at which the tangent is taken.
+            rows: convex program that gets the rows.
         """
         at, jerk, v = self._coarse, self._jerk, self._coarse.value @ c
         # Multiplied by sqrt(v) of the last round, so that rows are of order one.
@@ -552,9 +564,18 @@ class JerkProgram:
     def _solve_subset(
         self, H: Array, g: Array, scale: Array, rows: Mask, cones: Mask
     ) -> Array | None:
-        """Minimise c^T H c / 2 + g . c over coefficients c (k,), subject only to the rows and cones
-        that are marked True; None if the solver fails. `scale` (k,) holds typical sizes of the
-        coefficients; the solver's variables are c / scale.
+        """Minimise c^T H c / 2 + g . c over coefficients c (k,), subject to a subset of the
+        constraints.
+
+        Args:
+            H: (k, k) matrix of the objective.
+            g: (k,) vector of the objective.
+            scale: (k,) typical sizes of the coefficients; the solver's variables are c / scale.
+            rows: True for each linear row that is applied.
+            cones: True for each cone that is applied.
+
+        Returns:
+            The coefficients; None if the solver fails.
         """
         # Not imported at the top: only jerk limits need it.
         import clarabel

@@ -84,16 +84,21 @@ class PathLimits:
         return [(force / limit, slope / limit) for force, slope in found]
 
     def ratios(self, a: Array, w: Array) -> Array:
-        """Compute the limited quantities that are not convex in (u'', u'^2), over their limits.
+        """Compute, over their limits, the limited quantities that are not convex in (u'', u'^2).
 
-        These are joint torques with sign, pressure shifts and, unless the normal force of one pad
-        determines that of the other pad, robust forces.
+        The columns are, in this order and as far as limited:
+
+        - joint torques, with sign;
+        - pressure shifts of both pads;
+        - robust forces of both robots. They are left out if the normal force of one pad determines
+          that of the other pad, because `forces` has them then.
 
         Args:
-            a, w: (n,) values of u'' [1/s^2] and u'^2 [1/s^2].
+            a: (n,) path accelerations u'' [1/s^2].
+            w: (n,) squared path speeds u'^2 [1/s^2].
 
         Returns:
-            (n, k) ratios.
+            (n, k) ratios, k columns.
         """
         m, workcell, limits = self.motion, self._model.workcell, self._limits
         pressure = limits.pressure and self._model.carry_limits.has_pressure_limit

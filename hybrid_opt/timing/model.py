@@ -119,8 +119,8 @@ class PathMotion:
 
     @cached_property
     def _spline(self) -> tuple[CubicSpline, Array]:
-        """Cubic spline through all quantities side by side, and the index of the first column of
-        each quantity except the first.
+        """Cubic spline in the path parameter u through all arrays of the motion, their columns side
+        by side. The second item holds the index of the first column of each array except the first.
         """
         u = self.parameter[::_SPLINE_EVERY]
         columns = [
@@ -171,13 +171,16 @@ class CarryLimits:
         return not limit.option or bool(getattr(limits, limit.option))
 
     def ratios(self, carry: Carry, limits: TimingLimits) -> dict[str, Array]:
-        """Compute every limited quantity over its limit at n samples of a carry. `limits` are those
-        in addition to the workcell's.
+        """Compute every limited quantity over its limit at n samples of a carry.
+
+        Args:
+            carry: the carry.
+            limits: limits in addition to the workcell's.
 
         Returns:
-            Ratios by name: friction, and each limit of `symbolic.limits.LIMITS` that applies.
-            Arrays are (n, all joints) for limits of joints, (n, 2) of robots, (n, 1) of the
-            payload.
+            Ratios by name: the friction, and each limit of `symbolic.limits.LIMITS` that applies.
+            The shape is (n, joints of both arms) for a limit on joints, (n, 2) for a limit on
+            robots, and (n, 1) or (n,) for a limit on the payload.
         """
         bound = np.maximum(carry.normal_force * self._friction, LEAST_NORMAL_FORCE)
         ratios = {FRICTION_RATIO: carry.tangential_force / bound}
@@ -214,9 +217,14 @@ class CarryLimits:
         return np.maximum(carry.normal_force, np.stack([leading, commanded], axis=1))
 
     def _near_limit(self, carry: Carry, limits: TimingLimits) -> Array:
-        """Return `limited_force` (n, 2) [N] of a carry, exactly only for forces near the limit or
-        the largest force. Elsewhere planned forces replace robust ones, which takes a fraction of
-        the time.
+        """Compute `limited_force` (n, 2) [N] of a carry, with robust forces only where they matter.
+
+        Results near the limit or near the largest force are exact. Elsewhere planned forces replace
+        robust ones, which takes a fraction of the time.
+
+        Args:
+            carry: the carry.
+            limits: limits in addition to the workcell's.
         """
         if not limits.robust or limits.force is None:
             return self.limited_force(carry, limits)
@@ -244,8 +252,14 @@ def _bound_of(limit: Limit, workcell: Workcell) -> Array:
 def _robust_forces_above(
     level: float, points: PathPoints, path: RobustPath, found: Array, every: int = 1
 ) -> bool:
-    """Raise entries of `found` (n, 2) [N] to the robust forces of `path` at n points, where these
-    exceed a level [N]. Only every point with an index divisible by `every` is evaluated.
+    """Raise entries of `found` to the robust forces at n points, where these exceed a level.
+
+    Args:
+        level: normal force [N] below which robust forces are ignored.
+        points: n points of the path.
+        path: computes robust forces.
+        found: (n, 2) normal forces of both robots [N], changed in place.
+        every: only points with an index divisible by this number are evaluated.
 
     Returns:
         True if any robust force exceeds the level.

@@ -112,11 +112,13 @@ class Evidence:
         self.entries.append(EvidenceEntry(name, found, key))
 
     def set_uncertainty(self, name: str, value: Any) -> None:
-        """Set an entry of the table `[uncertainty]`, rounded up to four decimals.
+        """Store a new range for the table `[uncertainty]` in `ranges`.
+
+        Numbers are rounded to four decimals, towards the larger number; negative ones become zero.
 
         Args:
-            name: key of the entry.
-            value: value of the entry.
+            name: key in the table `[uncertainty]`.
+            value: half-width of the range in the unit of that key: a number or a list.
         """
         up = np.ceil(np.maximum(1e4 * np.asarray(value, dtype=float) - 1e-6, 0.0)) / 1e4
         self.ranges[name] = up.tolist()

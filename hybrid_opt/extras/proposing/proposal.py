@@ -427,9 +427,18 @@ class _Search:
     def _paths(
         self, setup: Setup, pair: Pair, effort: int, strays: int, box: PayloadSceneChecker
     ) -> Iterator[list[ChainConfiguration] | None]:
-        """Yield the corners of collision-free paths with the holds `pair` of both arms, None for a
-        search without result. A planner may check `effort` configurations, 0 for straight paths,
-        and tries the first `strays` of `STRAYS`, allowed deviations from a straight path.
+        """Plan collision-free paths of the box between the start and the goal.
+
+        Args:
+            setup: the cell with its placed robots.
+            pair: how both arms hold the box at the start and at the goal.
+            effort: number of configurations that each planner may check; 0 for straight paths only.
+            strays: number of entries of `STRAYS` that are tried in order; each is the allowed
+                deviation from a straight path.
+            box: collision checker of the box.
+
+        Yields:
+            Corners of a path, from start to goal; None for a planner that finds no path.
         """
         if not effort:
             found = straight_paths(pair.chain, pair.retreats, box)

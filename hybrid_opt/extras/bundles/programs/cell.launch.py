@@ -29,13 +29,15 @@ def generate_launch_description() -> Any:
 
 
 def actions(each: dict[str, Any]) -> list[Any]:
-    """Return the launch actions of one entry of config/cell.json.
+    """Return the launch actions of one robot, or of one controller manager, of config/cell.json.
 
-    They start a driver's launch file or a robot description, a controller manager, and its
-    controllers.
+    The actions start a driver's launch file or a robot description, then a controller manager if
+    the table names parameter files, then the controllers.
 
     Args:
-        each: the entry.
+        each: one table of config/cell.json with the keys `namespace`, `parameters` (paths of
+            parameter files in the bundle) and `controllers` (names), all possibly empty. For a
+            driver it has also `package`, `file` and `arguments` of its launch file.
     """
     parameters: list[Any] = [str(BUNDLE / name) for name in each["parameters"]]
     outside, inside = list[Any](), list[Any]()
