@@ -272,13 +272,14 @@ def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     """Build the functions of joint torques and pressure shifts over their limits at one sample, and
     of their derivatives by the timing. These limits are not convex in u'' and u'^2.
 
-    limit_ratios takes one vector, the blocks force, moment, torque and wrench of `limit_layout`; a
-    = u''; w = u'^2; the payload's symbolic parameters; and the solved variables of
-    `force_functions`. It returns the ratios (joints + 2,) of `contact_limits`.
+    Inputs of both: one vector, the blocks force, moment, torque and wrench of `limit_layout`; a =
+    u''; w = u'^2; the payload's symbolic parameters; and the solved variables of `force_functions`.
 
-    limit_slopes takes the same inputs. It returns the ratios and their derivatives (joints + 2,) by
-    a and by w. If a convex program finds the forces, the two pressure ratios are zero: they are no
-    limit.
+    - limit_ratios returns the ratios (joints + 2,): signed joint torques of both arms, then the
+      shifts of both centres of pressure over the patch radii.
+    - limit_slopes returns the ratios, then their derivatives (joints + 2,) by a and by w.
+
+    If a convex program finds the forces, pressure is not limited and its two ratios are zero.
     """
     sizes = limit_layout(workcell).sizes
     names = ("force", "moment", "torque", "wrench")

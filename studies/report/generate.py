@@ -157,8 +157,8 @@ def make_report(
 
     Args:
         root: the results folder.
-        settings: by name the arguments `with_paper` and `pdf` of `write_report`, and `paper`, True
-            to draw the paper's pictures.
+        settings: booleans under three names: `with_paper` and `pdf`, the arguments of
+            `write_report`; and `paper`, True to draw the paper's pictures.
         progress: display of the progress.
         workers: processes that draw.
 

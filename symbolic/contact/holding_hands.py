@@ -253,11 +253,11 @@ class HoldingHands(ContactModel):
         displaced: bool = False,
     ) -> HeldLoad:
         """Return the least holding forces for a load, and the wrench with which each arm's hands
-        balance it.
+        balance the load.
 
-        In the result, `normal` is the least holding force of each arm's hands, and `tangential` the
-        part of the load that friction under the holding force must bear. So `tangential` never
-        exceeds friction times `normal`.
+        In the result, `normal` is the least holding force of each arm's hands. `tangential` is the
+        part of the load that friction under the holding force must bear, at most friction times
+        `normal`.
 
         Args:
             load: load on the hands of both arms.

@@ -130,8 +130,7 @@ def torsion_capacity(
         patch: patch of the pad.
 
     Returns:
-        The torsion [N m], from formula (1) of the module's docstring, and its derivative by the
-        grip [m].
+        The torsion [N m], and its derivative by the grip [m].
     """
     return _capacity(grip, _squared(tangent), patch.twist, _half_spread(patch, tangent))
 
