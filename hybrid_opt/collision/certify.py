@@ -244,12 +244,16 @@ def _straight_grid(
 
 
 def _farthest(checker: CollisionChecker, configuration: Array, other: Array) -> Array:
-    """Compute a bound of the relative motion of the bodies of any pair between two configurations,
-    (n,) [m].
+    """Bound, for n motions from one configuration to another, how far the bodies of any pair move
+    relative to each other.
 
     Args:
         checker: collision checker of the workcell.
-        configuration, other: (n, 6 + all joints) the two configurations of each row.
+        configuration: (n, 6 + all joints) first configuration of each motion.
+        other: (n, 6 + all joints) last configuration of each motion.
+
+    Returns:
+        (n,) the largest bound of all pairs [m].
     """
     off = np.empty(len(configuration))
     for start in range(0, len(off), CACHED_ROWS):

@@ -64,7 +64,7 @@ class BodyDistances:
     """
 
     def __init__(self, geometry: CellGeometry, resting_tolerance: float) -> None:
-        """Prepare the shapes.
+        """Build the shapes of all bodies, and of the payload made smaller, for distance queries.
 
         Args:
             geometry: bodies of the workcell.

@@ -107,8 +107,8 @@ def joint_tables(geometry: CellGeometry) -> tuple[JointTable, ...]:
 
 
 def _in_root(body: CollisionBody, arm: ArmGeometry) -> tuple[Piece, ...]:
-    """Return the pieces (convex solids) of a body in a frame that does not depend on the place of
-    the arm.
+    """Return the pieces (convex solids) of a body in a frame of the arm, so that they do not depend
+    on where the arm stands.
 
     This is the link's frame for a moving link, and the frame of the arm's root for a fixed body.
     The poses of a fixed body's pieces are rounded.

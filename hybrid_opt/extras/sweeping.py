@@ -284,12 +284,13 @@ def _loaded(cell: Cell) -> Cell:
 def _next_row(
     request: _Request, combination: tuple[tuple[float, ...], Array | None]
 ) -> Combination:
-    """Compute the result of one combination.
+    """Compute the result of one combination of numbers of the workcell file.
 
     Args:
-        request: data that all combinations share, such as the unchanged cell.
-        combination: the values, and the decision vector (n_var,) of the carry of a similar
-            combination, or None.
+        request: what all combinations share, such as the unchanged cell and the keys of the
+            numbers.
+        combination: the numbers, in the order of the request's keys; and the decision vector
+            (n_var,) of the carry of a similar combination, None without one.
     """
     numbers, near = combination
     known = [request.x] if near is None or request.fixed else [request.x, near]
@@ -318,13 +319,14 @@ def _row(
 
 
 def _tried(cell: Cell, near: Sequence[Array], fixed: bool) -> Evaluations:
-    """Evaluate paths in a changed cell, each with its best force limit. The hand-made path is added
-    unless the path is fixed.
+    """Evaluate paths in a changed cell, each with its best force limit.
+
+    The hand-made path is evaluated with them, unless `fixed` is True.
 
     Args:
         cell: the changed cell.
         near: decision vectors (n_var,) of the paths.
-        fixed: True if the path is kept.
+        fixed: True if the path may not be replaced by another one.
     """
     x = np.array([x[:-1] for x in (near if fixed else [*near, cell.initial])])
     paths = DrivenPaths(cell, x)

@@ -141,14 +141,18 @@ class Distances:
     def __init__(
         self, bounds: Array, measure: Callable[..., object], configuration: Sequence[NDArray[Any]]
     ) -> None:
-        """Interpolate the minima of the bounds; no distance is measured yet.
+        """Estimate the distance of each pair of bodies at n places from lower bounds; nothing is
+        measured yet.
+
+        Near the minima along the path the bounds of close pairs are interpolated between the
+        places.
 
         Args:
             bounds: (n, n_pairs) lower bounds of the distances [m].
             measure: `CollisionChecker.measure`, which raises chosen bounds to measured distances in
                 place.
-            configuration: first arguments of `measure`: box poses and joint positions of both arms
-                at the n places.
+            configuration: the first three arguments of `measure`: box poses, and joint positions of
+                the first and of the second arm, at the n places.
         """
         near = bounds.min(axis=0, initial=np.inf) < MINIMA_BELOW
         self.bounds, self.interpolated_clearance = bounds, bounds.copy()

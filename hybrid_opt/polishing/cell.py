@@ -201,11 +201,15 @@ def _held(model: CellModel) -> dict[str, ca.Function]:
 
 
 def _driven_held(model: CellModel) -> dict[str, ca.Function]:
-    """Return the functions of grasp forces, by name, with the barrier weight that the timing uses.
+    """Build the functions of grasp forces, with the barrier weight that the timing uses.
+
     So polish and timing compute equal forces.
 
     Args:
         model: arms and bodies of the cell.
+
+    Returns:
+        CasADi functions by name.
     """
     return grasp_force_functions(model.workcell, TIMING_BARRIER_WEIGHT)
 
@@ -214,7 +218,8 @@ def _names(quantities: tuple[Quantity, ...]) -> set[str]:
     """Return the names of all functions that `polish_functions` builds.
 
     Args:
-        quantities: names of the quantities that are evaluated at samples.
+        quantities: what is evaluated at samples: 'force', 'pressure' or 'load', as far as the cell
+            needs it.
     """
     blocks = ("inner", "first", "last", "path")
     return {
@@ -302,7 +307,8 @@ class SmoothCell:
     def __init__(
         self, evaluator: CandidateEvaluator, functions: PolishFunctions, clearance: float
     ) -> None:
-        """Collect the data.
+        """Derive from a cell's task the half ranges and centre of the variables, the grid of places
+        and the blocks of samples.
 
         Args:
             evaluator: evaluator of candidates by the full model.

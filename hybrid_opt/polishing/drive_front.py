@@ -115,7 +115,8 @@ class DriveRun(PolishRun[DriveAttempt]):
         on_progress: Callable[[int, int], None],
         paths: Array,
     ) -> None:
-        """Collect the known paths.
+        """Evaluate at rest the paths of the archive, the hand-made one and further ones, to find
+        the least force limit of the front.
 
         Args:
             drive_method: step method of drivable carries.

@@ -300,9 +300,9 @@ def made_little_progress(
 
 
 def _target(archive: ParetoArchive, k: int, step: float) -> Scalarisation:
-    """Return the scalarisation that aims at a point of the front at a signed distance `step`
-    [front's extent] along the front from the point with index `k` in the archive.
-    """
+    """Return the scalarisation that aims at a point beside point `k` of the archive, at the signed
+    distance `step` [front's extent]. If `step` is positive, the point aimed at has a larger first
+    and a smaller second objective."""
     span = archive.span()
     aside = np.array([0.5, -0.5]) * step * span
     return pascoletti_serafini(archive.objectives[k] + aside, span)
@@ -431,8 +431,7 @@ class ForceRun(PolishRun[ForceAttempt]):
 
     def _starts(self, objective: int | None) -> int:
         """Return the number of starts of short solves towards the end of the front with this
-        objective, or towards the balanced middle (None): at most twice the remaining attempts.
-        """
+        objective (its index; None: the balanced middle): at most twice the remaining attempts."""
         probe = self._settings.probe
         count = probe.starts if self._mirror is not None else (probe.starts + 1) // 2
         return min(2 * self._ahead, probe.middle_starts if objective is None else count)
@@ -481,9 +480,8 @@ class ForceRun(PolishRun[ForceAttempt]):
         return gaps(self._archive)[place - 1].width > FAR_GAP
 
     def _gaps(self, solved: int) -> Iterator[ForceAttempt]:
-        """Yield attempts in gaps until the front has `solved` points or attempts started from all
-        sides of gaps; then add points on the lines across the remaining gaps.
-        """
+        """Yield attempts that fill gaps, until the front has `solved` points or attempts started
+        from all sides of gaps; then add points on the lines across the remaining gaps."""
         tried: set[Edge] = set()
         self._most_attempts += self._settings.fill.attempts * self._settings.attempts
         while self._attempts_left() > 0:
@@ -583,8 +581,7 @@ class ForceRun(PolishRun[ForceAttempt]):
         self, objectives: tuple[int | None, ...], rng: np.random.Generator
     ) -> Iterator[ForceAttempt]:
         """Yield one attempt for each objective (its index, or None for the balanced middle), and
-        count the attempts without progress.
-        """
+        count the attempts without progress."""
         perturb = partial(perturb_start, self._evaluator, rng=rng)
         for objective in objectives:
             before, stalls = self._archive.best(objective)[1], self._stalls[objective]

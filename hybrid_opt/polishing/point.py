@@ -424,10 +424,10 @@ class TrustRegionSolve(Generic[AnyIterate, AnyStep]):
         )
 
     def _keep_best(self, step: AnyStep, trial: AnyIterate) -> None:
-        """React to a step that violates nothing but does not improve.
+        """React to a step that violates nothing but does not improve the candidate.
 
-        Rows (scalar inequalities) that the program lacked are added. Without such rows the solve
-        finishes if the step is optimal and inside the box, else the radius shrinks.
+        Rows (scalar inequalities) that the quadratic program lacked are added. If none was lacking,
+        the solve ends for an optimal step inside the trust region; otherwise the radius shrinks.
 
         Args:
             step: the step.

@@ -122,7 +122,7 @@ class _SampleRows:
     def __init__(
         self, cell: SmoothCell, quantity: Quantity, wanted: Collection[int], beyond: int = 0
     ) -> None:
-        """Arrange the samples that a program needs.
+        """Allocate the arrays of a quantity at the samples that an optimisation step needs.
 
         Args:
             cell: shared data of the polish.
@@ -207,11 +207,12 @@ class ConstraintRows:
         Args:
             cell: shared data of the polish.
             layout: order of the rows.
-            q: (m, n) for each arm, joint positions at all places near those that hold the box
-                [rad].
-            mix: (n_forces, 2) coefficients of each force row: of the normal and tangential part of
-                the required force for the paper's contact model, of both normal forces if a convex
-                program computes them. None without force rows.
+            q: joint positions of each arm, (m, n) for m places and n joints [rad]. They are close
+                to the positions that hold the box.
+            mix: (n_forces, 2) two coefficients of each force row; None without force rows. With the
+                paper's contact model they multiply the normal and the tangential part of the
+                required force. If a convex program computes the forces, they multiply both normal
+                forces.
             fixed: (n_rows, k) coefficients of the k further variables; None for k = 0.
 
         Raises:
@@ -226,18 +227,19 @@ class ConstraintRows:
         )
 
     def _lay_out_samples(self, layout: RowLayout) -> dict[str, Any]:
-        """Prepare the evaluation of force and pressure rows.
+        """Build the arguments of the C++ class `Rows` (rows.cpp) that describe force and pressure
+        rows.
 
         Forces without closed form follow by a convex program
-        (`symbolic.smooth.samples.grasp_force_functions`) from the load of a sample, the force and
-        moment that the box needs. The program is solved once per load. Derivatives follow by the
+        (`symbolic.smooth.samples.grasp_force_functions`) from the force and moment that the box
+        needs at a sample. The convex program is solved once per sample. Derivatives follow by the
         chain rule.
 
         Args:
             layout: order of the rows.
 
         Returns:
-            Arguments of `rows.cpp` by name.
+            Arguments by the names that rows.cpp gives them.
         """
         cell, rows = self._cell, layout.force_rows
         own = sorted({row.sample for row in rows if row.branch == PROGRAM_BRANCH})

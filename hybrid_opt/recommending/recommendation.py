@@ -297,10 +297,10 @@ def _driven(
     Args:
         cell: drivable cell.
         paths: paths of the front.
-        options: timings of the paths with jumps of acceleration.
-        goal: limits, and cost to minimise.
-        wished: True if the user gave a target. Otherwise, if no carry keeps the limits, the carry
-            is chosen that exceeds the force limits least.
+        options: timings with jumps of acceleration, of these paths within several force limits.
+        goal: limits on duration and force, and the cost to minimise.
+        wished: True if the user gave a duration or force. If False and no carry keeps the limits,
+            the carry is chosen that exceeds the force limits least.
 
     Returns:
         Path and force limit of the carry, its timing, and True if it keeps the limits of the goal.

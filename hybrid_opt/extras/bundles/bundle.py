@@ -336,7 +336,8 @@ def _number(value: Any) -> int | None:
 
 
 def _word(text: str) -> str:
-    """Convert a text to a form that is valid in the name of a file on every system."""
+    """Convert a text to a part of a file name that is valid on every system: lower-case ASCII
+    letters, digits and single hyphens."""
     kept = "".join(c if c.isascii() and c.isalnum() else "-" for c in text.lower())
     return "-".join(part for part in kept.split("-") if part)[:LONGEST_WORD].strip("-")
 

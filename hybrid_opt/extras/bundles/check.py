@@ -212,8 +212,9 @@ def _csv_columns(text: str) -> tuple[Columns, tuple[float, float] | None]:
         text: text of the file.
 
     Returns:
-        Times (n,) [s] with the columns (n,) by quantity and joint name; and the first and last time
-        at which the column `phase` is 'carry' [s], None if there is none.
+        - Times (n,) [s], and the columns (n,) by quantity and joint name.
+        - First and last time [s] at which the column `phase` is 'carry'; None if no row has this
+          phase.
     """
     rows = list(csv.reader(io.StringIO(text)))
     header, body = rows[0], [row for row in rows[1:] if row]
@@ -376,14 +377,14 @@ def check(
 
 
 def _places(time: Array) -> Array:
-    """Return the times of n samples, with further times between neighbours at the shares `BETWEEN`
-    of each step.
+    """Insert further times between the times of n samples.
 
     Args:
         time: (n,) ascending times of the samples [s].
 
     Returns:
-        (k,) ascending times [s].
+        (k,) ascending times [s]: those of the samples and, in each step between two of them, those
+        at the shares `BETWEEN` of the step.
     """
     steps = np.diff(time)
     inside = [time[:-1] + share * steps for share in (0.0, *BETWEEN)]

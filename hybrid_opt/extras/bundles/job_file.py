@@ -356,14 +356,16 @@ class Export:
         return contact_torque(first, matrices, np.swapaxes(wrench, 0, 1))
 
     def _of_other(self, contact: Array) -> Array:
-        """Return the torques (n, joints) that each arm's contact causes in the joints that move
-        both arms, in the columns of the other arm [N m, for sliding joints N].
-
-        The columns of all other joints are zero.
+        """Compute the joint torques that each arm's contact causes in the joints that move both
+        arms, and put them into the columns of the other arm.
 
         Args:
-            contact: (n, joints) torques of each arm's own contact, both arms side by side [N m, for
+            contact: (n, joints) torques by each arm's own contact, both arms side by side [N m, for
                 sliding joints N].
+
+        Returns:
+            (n, joints) torques [N m, for sliding joints N]; zero in the columns of all joints that
+            move one arm only.
         """
         found, (own, other) = np.zeros_like(contact), self.job.joint_names
         for name in common_joints(self.workcell.robots):

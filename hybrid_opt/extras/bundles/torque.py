@@ -225,15 +225,17 @@ def torque_files(export: Export) -> dict[str, str | bytes]:
 
 
 def _grip(export: Export, arm: int) -> dict[str, Any]:
-    """Return how the hands of an arm are switched and watched in ROS.
+    """Describe how the hands of an arm are switched and watched in ROS.
 
     Args:
         export: the job.
         arm: index of the arm.
 
     Returns:
-        Name and type of the service, the requests `on` and `off`, and under `input` the topic on
-        which the hands report that they hold, None if there is none.
+        - `name` and `kind`: name and type of the service that switches the hands.
+        - `on` and `off`: fields of the service's request that close and open them.
+        - `input`: `topic`, `kind` (message type) and `pin` with which the hands report that they
+          hold; None if they report nothing.
     """
     driver = export.workcell.robots[arm].driver
     io = f"/{_values(export, arm)['space']}/io_and_status_controller"
@@ -259,15 +261,19 @@ def _controllers(
     joints: Mapping[str, int],
     broadcasters: Mapping[str, Mapping[str, Any]],
 ) -> str:
-    """Return the parameters of a controller manager and its controllers as JSON, which is valid
+    """Build the parameters of a controller manager and its controllers as JSON, which is valid
     YAML.
 
     Args:
-        export: the export.
+        export: the job.
         driver: name of the driver.
-        joints: index among both arms' joints by the joint's name in ROS.
-        broadcasters: parameters of further controllers by name; their `type` belongs to the
-            manager.
+        joints: names in ROS of the manager's joints, each with its index among the joints of both
+            arms.
+        broadcasters: parameters of each further controller, by its name. Their key `type` goes to
+            the manager.
+
+    Returns:
+        The content of the parameter file.
     """
     cell = export.workcell
     rates = [robot.driver.rate for robot in cell.robots if robot.driver.rate is not None]
@@ -316,7 +322,8 @@ def joint_inertia(job: Job) -> Array:
 
 
 def _values(export: Export, arm: int) -> dict[str, Any]:
-    """Return the values for an arm's template that all drivers need.
+    """Return the values that replace the placeholders of an arm's template, as far as all drivers
+    need them.
 
     Args:
         export: the job.
@@ -344,14 +351,15 @@ def _values(export: Export, arm: int) -> dict[str, Any]:
 
 
 def _franka(export: Export, arm: int) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Return the values for a Franka arm's template, and the parameters of its broadcasters.
+    """Return what a Franka arm adds to the files of its bundle.
 
     Args:
         export: the job.
         arm: index of the arm.
 
     Returns:
-        Values by name of the placeholder; and parameters by name of the controller.
+        - Values that replace the placeholders of the arm's template, by name of the placeholder.
+        - Parameters of the arm's broadcasters, by name of the controller.
 
     Raises:
         SettingsError: a torque changes faster than libfranka accepts.
@@ -409,15 +417,15 @@ def _contact(job: Job, arm: int) -> tuple[Array, tuple[float, float]]:
 
 
 def _ur(export: Export, arm: int) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Return the values for a Universal Robots arm's template, and the parameters of its
-    broadcasters.
+    """Return what a Universal Robots arm adds to the files of its bundle.
 
     Args:
         export: the job.
         arm: index of the arm.
 
     Returns:
-        Values by name of the placeholder; and parameters by name of the controller.
+        - Values that replace the placeholders of the arm's template, by name of the placeholder.
+        - Parameters of the arm's broadcasters, by name of the controller.
     """
     found = re.search(UR_TYPE, described(export.workcell.robots[arm]))
     values = _values(export, arm)

@@ -233,13 +233,14 @@ def _pieces(run: Recording, places: Places) -> list[MeasuredHold]:
 
 
 def _empty(run: Recording, pieces: list[MeasuredHold], evidence: Evidence) -> None:
-    """Determine the largest force that the sensors show in a run without a box; it is a fault if it
-    is too large.
+    """Determine the largest force that the sensors show in a run without a box.
+
+    The force counts as a fault if it is too large.
 
     Args:
         run: the run.
         pieces: measurements of the parts of the run in which the arms are still.
-        evidence: the results, to which the force is added.
+        evidence: the collected results, to which the force is added.
     """
     if not pieces:
         return
@@ -256,12 +257,15 @@ Sound = list[tuple[Recording, Places]]
 
 
 def _load(sound: Sound, evidence: Evidence) -> Load | None:
-    """Determine mass, centre of mass and crosstalk as far as the runs allow. Return None if there
-    are no holds, or the holds have faults.
+    """Determine the payload's mass, centre of mass and crosstalk, as far as the recorded runs
+    allow.
 
     Args:
         sound: recordings without serious faults, each with its pad poses and wrenches.
-        evidence: the results, to which the values are added.
+        evidence: the collected results, to which these are added.
+
+    Returns:
+        The estimate; None if there are no holds, or the holds have faults.
     """
     holds, moments = [], True
     for run, places in sound:
@@ -382,12 +386,13 @@ def _friction(sound: Sound, load: Load | None, evidence: Evidence) -> None:
 
 
 def _tracking(sound: Sound, evidence: Evidence) -> None:
-    """Determine how closely the measured normal force follows the commanded one: quantiles of their
-    ratio, and the delay.
+    """Determine how closely the measured normal force follows the commanded one.
+
+    The results are quantiles of measured over commanded force, and the delay of the measured force.
 
     Args:
         sound: recordings without serious faults, each with its pad poses and wrenches.
-        evidence: the results, to which the values are added.
+        evidence: the collected results, to which these are added.
     """
     worst: list[float] = []
     for i in range(2):

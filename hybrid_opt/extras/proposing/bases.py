@@ -114,7 +114,8 @@ def _scored(
         rng: generator of random postures.
 
     Returns:
-        Pairs of a score, larger is better, and the keys to add to the tables of the problem file.
+        For each proposal a score, of which a larger one is better, and the keys that put the bases
+        into the tables of the problem file.
     """
     draft = draft_of(problem)
     scorer = PlaceScorer(problem, draft, spins, rng)

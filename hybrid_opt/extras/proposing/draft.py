@@ -144,11 +144,15 @@ def decision_bounds(workcell: Workcell) -> tuple[Array, Array]:
 
 
 def _boxes(found: Draft, waypoints: Array) -> Array:
-    """Compute lower and upper bounds (2, n, 6 + m) of waypoints, rounded to the decimals of a file.
+    """Compute the bounds of waypoints, rounded outwards to the decimals of a file.
 
     Args:
-        found: the draft. If it has no bounds, each waypoint gets bounds at a fixed distance.
-        waypoints: (n, 6 + m) box poses [m, rad] and redundant joints [rad or m].
+        found: the draft. If it has no bounds, the bounds of each waypoint are at the fixed distance
+            `DRAFT_ROOM` from it.
+        waypoints: (n, 6 + m) box poses [m, rad] and m redundant joints [rad or m].
+
+    Returns:
+        (2, n, 6 + m) lower and upper bounds.
     """
     bounds = np.array([waypoints - DRAFT_ROOM, waypoints + DRAFT_ROOM])
     if found.bounds is not None:
@@ -158,13 +162,17 @@ def _boxes(found: Draft, waypoints: Array) -> Array:
 
 
 def _as_waypoints(x: Array, waypoints: Array, m: int) -> Array:
-    """Build the waypoints (n, 6 + m) of a decision vector, whose values replace the inner box poses
-    and all redundant joints of given waypoints.
+    """Put a decision vector into given waypoints.
+
+    Its values replace the inner box poses and all redundant joints.
 
     Args:
         x: (n_var,) decision vector [m, rad].
         waypoints: (n, 6 + m) given waypoints, whose first and last box poses are kept [m, rad].
         m: number of redundant joints.
+
+    Returns:
+        (n, 6 + m) waypoints.
     """
     n = len(waypoints)
     placed = waypoints.copy()

@@ -452,12 +452,12 @@ class _Finder:
         return arrived, path, self._score(path, room, measure)
 
     def _place_common(self, ends: Array) -> None:
-        """Set the joints that also move the other arm to their given positions at the goal, in
-        place.
+        """Overwrite positions at the goal of the redundant joints that also move the other arm,
+        with the positions given for them.
 
         Args:
-            ends: (n, redundant) positions of the redundant joints at the goal [rad or m], of which
-                these joints' columns are overwritten.
+            ends: (n, redundant) positions of the redundant joints at the goal [rad or m], changed
+                in place.
         """
         if self.query.common is not None:
             columns = [self.kinematics.redundant.index(k) for k in self.kinematics.common]
@@ -507,8 +507,9 @@ def manipulability_hint(kinematics: ArmKinematics, found: str) -> str:
 
 
 def _diverse(holds: Sequence[Hold], compared: int) -> list[Hold]:
-    """Sort holds such that holds which differ much from all before come first. Of nearly equal
-    holds only the first is kept.
+    """Sort holds so that those come first that differ much from all holds before them.
+
+    Of nearly equal holds only the first is kept.
 
     Args:
         holds: the holds (pad rotation, start and goal posture), best first.

@@ -379,15 +379,17 @@ def _turns(axis: Array, angle: Array) -> Array:
 
 
 def _error(target: Array, T: Array) -> tuple[Array, Array]:
-    """Compute the error between wanted and actual poses.
+    """Compute wanted poses minus actual poses, for Newton's method.
 
     Args:
         target: (n, 4, 4) wanted poses.
-        T: (n, 4, 4) actual poses.
+        T: (n, 4, 4) actual poses, in the same frame as `target`.
 
     Returns:
-        Position and rotation errors side by side (n, 6) [m, rad] for Newton's equations, and the
-        norm (n,) of both errors of each pose.
+        - Differences (n, 6): target position minus actual position [m], then the axis of the
+          rotation from the actual to the wanted orientation, times the sine of its angle. Axes are
+          those of the common frame.
+        - Norm (n,) of position difference and rotation together.
     """
     R, R_target = T[:, :3, :3], target[:, :3, :3]
     dR = R_target @ R.transpose(0, 2, 1)

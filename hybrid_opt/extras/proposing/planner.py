@@ -293,12 +293,12 @@ def plan(
 def _usable(
     stops: list[ChainConfiguration], place: ChainConfiguration, room: AffineSubspace
 ) -> list[ChainConfiguration]:
-    """Select the configurations that lie in a region and at least `SHORT_RETREAT` from one end of
-    the carry.
+    """Select the configurations that lie in a region and not too near to one end of the carry.
 
     Args:
         stops: the configurations.
-        place: configuration at the end of the carry: the start or the goal.
+        place: configuration at this end of the carry, the start or the goal; the least distance
+            from it is `SHORT_RETREAT`.
         room: the region.
 
     Returns:

@@ -427,18 +427,15 @@ class _Search:
     def _paths(
         self, setup: Setup, pair: Pair, effort: int, strays: int, box: PayloadSceneChecker
     ) -> Iterator[list[ChainConfiguration] | None]:
-        """Plan collision-free paths of the box between the start and the goal.
+        """Yield for each planner the corners of a collision-free path of the box, from start to
+        goal; None if it finds none.
 
         Args:
             setup: the cell with its placed robots.
             pair: how both arms hold the box at the start and at the goal.
-            effort: number of configurations that each planner may check; 0 for straight paths only.
-            strays: number of entries of `STRAYS` that are tried in order; each is the allowed
-                deviation from a straight path.
+            effort: number of configurations that a planner may check; 0 for straight paths only.
+            strays: number of tried entries of `STRAYS`, allowed deviations from a straight path.
             box: collision checker of the box.
-
-        Yields:
-            Corners of a path, from start to goal; None for a planner that finds no path.
         """
         if not effort:
             found = straight_paths(pair.chain, pair.retreats, box)
@@ -479,10 +476,9 @@ class _Search:
     def _judged(
         self, setup: Setup, pair: Pair, via: Array, box: PayloadSceneChecker
     ) -> Iterator[Proposal]:
-        """Yield the proposal whose carry passes the via-points `via` (k, 6 + m), box poses [m, rad]
-        and m redundant joints [rad or m]. Yield nothing if the evaluator refuses the carry, or if a
-        carry of its class was found before.
-        """
+        """Evaluate the carry through the via-points `via` (k, 6 + m), box poses [m, rad] and m
+        redundant joints [rad or m], and yield its proposal. Yield nothing if the evaluator refuses
+        the carry, or if a carry of its class was found before."""
         fitted = np.vstack([pair.start.extended, via, pair.goal.extended])
         if self._is_known(pair, box, _poses(fitted)):
             return
@@ -537,7 +533,7 @@ class _Search:
         self, setup: Setup, pair: Pair, waypoints: Array, bounds: Bounds | None = None
     ) -> Draft:
         """Build the draft of the carry through waypoints (n, 6 + m), box poses [m, rad] and m
-        redundant joints [rad or m], rounded as in a file. Pads keep their rotations of `pair`.
+        redundant joints [rad or m], rounded as in a file. The pads' rotations are those of `pair`.
         """
         spins = (pair.holds[0].spin, pair.holds[1].spin)
         rounded = np.round(waypoints, 4)
@@ -572,13 +568,8 @@ class _Search:
         return self.problem.workcell(changes(self.problem, found))
 
     def _bounds(self, trial: Trial, until: float) -> Bounds:
-        """Find bounds of the decision vector around the carry of a trial.
-
-        Args:
-            trial: the carry, with its evaluator.
-            until: time at which the search has to end, in seconds of the settings' clock since its
-                beginning [s].
-        """
+        """Find bounds of the decision vector around the carry of `trial`, until the time `until`
+        [s] after the start of the whole search."""
         unit, limits = decision_bounds(trial.workcell)
         low, high = self.settings.feasible
         sampling = Sampling(

@@ -242,15 +242,15 @@ def prepare(
 
 
 def _progress(searches: Sequence[HoldSearch]) -> tuple[float, ...]:
-    """Return a key that compares results of the search for holds. A key is larger if the less
-    successful arm got farther.
+    """Rank results of the search for holds by the less successful arm.
 
     Args:
         searches: result for each arm.
 
     Returns:
-        Of the less successful arm: number of holds, share of a box path that was followed, number
-        of collision-free postures, number of postures.
+        Four numbers of the less successful arm, compared in this order and larger if better: number
+        of holds, share of a box path that was followed, number of collision-free postures, number
+        of postures.
     """
     return min((len(one.holds), one.kept, one.free, one.within) for one in searches)
 

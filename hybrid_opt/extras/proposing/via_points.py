@@ -248,8 +248,9 @@ def _lengths(chain: ClosedChain, paths: Array, near: tuple[Array, Array]) -> tup
             starts [rad or m].
 
     Returns:
-        Lengths (k,) [rad], and costs (k,) [rad] that are 0 for paths without collisions whose every
-        pose both arms can hold.
+        - Lengths (k,) [rad].
+        - Costs (k,) [rad], which grow with the share of poses that an arm cannot hold or that
+          collide; 0 if there are none.
     """
     k, n, size = paths.shape
     begin = np.tile(near[0], (k, 1)), np.tile(near[1], (k, 1))

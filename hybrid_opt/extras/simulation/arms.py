@@ -149,12 +149,13 @@ class PressedBox(HeldBox):
         return less
 
     def _contacts(self) -> tuple[Indices, NDArray[np.bool_], Indices, Array]:
-        """Return the active contacts between pads and box.
+        """Return the n active contacts between pads and box.
 
         Returns:
-            Four arrays for n contacts. Index (n,) of the pad's robot; True (n,) if the pad is the
-            first of the two bodies; index (n,) of the first of three constraint rows; axes (n, 3,
-            3) of the contact as rows, world frame.
+            - Index (n,) of the pad's robot.
+            - True (n,) if the pad is the first of the two bodies in MuJoCo's contact.
+            - Index (n,) of the first of the contact's three constraint rows.
+            - Axes (n, 3, 3) of the contact as rows, world frame.
         """
         contact = self._data.contact
         sides = self._pad_of_geom[contact.geom]

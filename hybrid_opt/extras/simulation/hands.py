@@ -331,13 +331,13 @@ def _stiffness(hands: Iterable[Contact], layer: float) -> Array:
 
 
 def _displacement(workcell: Workcell, layer: float, opposed: ArrayLike) -> Array:
-    """Compute the displacement of the second arm, without rotation, that makes the arms work
+    """Compute how far the second arm is to be displaced, without rotation, so that the arms work
     against each other with a given force.
 
     Args:
         workcell: the cell.
         layer: stiffness of the hands' elastic layers per area [N/m^3].
-        opposed: (3,) the force on the payload, box frame [N].
+        opposed: (3,) force of the second arm's hands on the payload, box frame [N].
 
     Returns:
         (3,) displacement in the box frame [m].
@@ -400,16 +400,15 @@ def _along(hand: Contact, settings: SimulationSettings) -> tuple[float, float]:
 
 
 def _own(hand: Contact, settings: SimulationSettings, motion: CarriageMotion) -> Array:
-    """Compute the forces that accelerate a hand's own inertia, along its three joints: both axes of
-    the patch [N], and the rotation about the normal [N m].
+    """Compute the forces that accelerate a hand's own inertia.
 
     Args:
         hand: the hand.
         settings: settings of the simulation.
-        motion: motion of the carriage at n time steps.
+        motion: motion at n time steps of the carriage, the body that bears the hands.
 
     Returns:
-        (n, 3) forces.
+        (n, 3) forces along both axes of the patch [N], and moment about the normal [N m].
     """
     inertia = np.array(_along(hand, settings)) / HAND_FREQUENCY**2
     R = hand.T_box_pad[:3, :3]

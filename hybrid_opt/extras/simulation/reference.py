@@ -311,12 +311,14 @@ def _counts(workcell: Workcell) -> list[int]:
 
 
 def _with_rest(values: Array, keep: float) -> Array:
-    """Prepend two rows for a time at rest to an array (n, ...). Both are copies of the first row
-    multiplied by a factor.
+    """Insert two rows for a time at rest before an array. Each is the first row times a factor.
 
     Args:
         values: (n, ...) the array.
-        keep: the factor: 1 for positions, 0 for rates.
+        keep: the factor: 1 for positions, 0 for rates per time.
+
+    Returns:
+        (n + 2, ...) array.
     """
     return np.concatenate([keep * values[:1], keep * values[:1], values])
 

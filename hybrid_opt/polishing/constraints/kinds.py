@@ -199,8 +199,13 @@ class Forces(ConstraintKind[ForceRow]):
         }
 
     def _values(self, carry: PlacedCarry) -> Array:
-        """Compute every branch (linear function whose maximum is the normal force) of both robots,
-        (samples, 2, branches) [N].
+        """Compute the branches of the normal forces: linear functions whose maximum is the force.
+
+        Args:
+            carry: the carry.
+
+        Returns:
+            (samples, 2, branches) values for both robots [N].
         """
         return np.asarray(np.einsum("rbk,nk->nrb", self.cell.coefficients, carry.split))
 
@@ -217,12 +222,18 @@ class Forces(ConstraintKind[ForceRow]):
         return {int(k) for k in (tops[:, None] + np.array([-1, 0, 1])).ravel()}
 
     def _other_branches(self, carry: PlacedCarry) -> list[ForceRow]:
-        """Return rows (scalar inequalities) for branches (linear functions whose maximum is the
-        normal force) other than the one with tight friction cones, at samples where they are the
-        largest or nearly so.
+        """List the branches that come near to a normal force besides the branch with tight friction
+        cones.
 
-        The list is empty for robust forces, and for forces that a convex program computes. Such
-        forces have one row per robot and sample.
+        A branch is one of the linear functions whose maximum is the normal force. Robust forces
+        have no branches, and forces that a convex program computes have none either; the list is
+        empty for these.
+
+        Args:
+            carry: the carry.
+
+        Returns:
+            One row (scalar inequality) for each such branch, robot and sample.
         """
         if self.cell.robust is not None or self._main == PROGRAM_BRANCH:
             return []

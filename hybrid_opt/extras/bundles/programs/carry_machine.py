@@ -65,13 +65,13 @@ class Clock:
     """
 
     def __init__(self, end: float, stop_time: float, s: float = 0.0, rate: float = 0.0) -> None:
-        """Start at a place with a rate.
+        """Start the clock at a planned time.
 
         Args:
             end: planned time of the end of the path [s].
-            stop_time: duration of a change of the rate by 1 [s].
-            s: planned time of the first place [s].
-            rate: first derivative of s with respect to time.
+            stop_time: duration in which the rate changes by 1 [s].
+            s: planned time at the start [s].
+            rate: initial derivative ds/dt; 1 is the planned speed.
         """
         self.s, self.rate, self._stop_time = s, rate, stop_time
         self._low, self._high = 0.0, end
@@ -384,11 +384,17 @@ class Machine:
                 self.hold(str(error))
 
     def _lands(self, force: str) -> bool:
-        """Return True if a wrong force means that the box stands already in the last part of its
-        set-down. The arms then stop there, unless the release begins sooner.
+        """Decide whether a wrong force may mean that the box stands already, in the last part of
+        its set-down.
+
+        If it may, the machine stops the arms there, unless the release begins before they would
+        stand.
 
         Args:
-            force: reason why the measured forces are wrong, '' if they are right.
+            force: reason why the measured forces are wrong.
+
+        Returns:
+            True in the last part of the set-down.
         """
         if not self.job.is_touching(self.clock.s):
             return False

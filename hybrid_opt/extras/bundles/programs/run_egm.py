@@ -76,10 +76,11 @@ class Press:
     """
 
     def __init__(self, config: dict[str, Any]) -> None:
-        """Start at the planned position.
+        """Start with a pad at its planned position, without displacement.
 
         Args:
-            config: settings `gain`, `most`, `speed` and `compliance` of the bundle.
+            config: settings of the bundle, of which `gain`, `most`, `speed` and `compliance` are
+                read.
         """
         self.way = 0.0
         self._missing = 0.0
@@ -293,11 +294,14 @@ class Stream:
         return to_robot(number, now, joints, further)
 
     def _inward(self, s: float) -> list[float]:
-        """Compute the motion of each joint of the pressing arm per motion of its pad along the
-        normal [rad/m].
+        """Compute for each joint of the pressing arm its motion per motion of the pad along the
+        normal, into the box.
 
         Args:
-            s: planned time of the place on the path [s].
+            s: planned time [s] on the path at which this is computed.
+
+        Returns:
+            One value for each joint [rad/m], interpolated between the samples of the job.
         """
         rows, time = self.config["inward"], self.job.time
         k = min(max(bisect_left(time, s) - 1, 0), len(rows) - 2)
