@@ -286,11 +286,10 @@ AnyRows = TypeVar("AnyRows", bound=Rows)
 
 
 def of_rows(made_of: Callable[[list[Any]], Any], records: Sequence[AnyRows]) -> AnyRows:
-    """Combine several records of one type into one record, whose fields combine the arrays of the
-    records' fields.
+    """Combine several records of one type into one record, field by field.
 
     Args:
-        made_of: function that combines a list of arrays, the same field of all records, to one
+        made_of: function that combines a list of arrays, the same field of every record, to one
             array.
         records: the records.
     """

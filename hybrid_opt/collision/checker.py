@@ -195,15 +195,18 @@ class CollisionChecker:
     def motion(
         self, start: tuple[Array, Array, Array], end: tuple[Array, Array, Array]
     ) -> tuple[Array, Array]:
-        """Compute bounds of the relative motion of every pair between two configurations.
+        """Compute bounds of the relative motion of the two bodies of every pair between two
+        configurations.
 
         Args:
-            start, end: each a box pose (n, 6) and joint positions q_1 and q_2 (n, joints).
+            start, end: each a box pose (n, 6) [m, rad] and joint positions q_1 and q_2 (n, joints)
+                [rad].
 
         Returns:
-            Chord and bend (n, n_pairs) [m]. The chord bounds the distance that the bodies of a pair
-            move relative to each other from start to end, the bend the second derivative of this
-            motion (`symbolic.geometry.clearance`).
+            - Chord (n, n_pairs) [m]: a bound of the distance that the bodies move relative to each
+              other from start to end.
+            - Bend (n, n_pairs) [m]: a bound of the second derivative of this motion by the share of
+              the way (`symbolic.geometry.clearance`).
         """
         asked = [self.functions[f"{block}motion"] for block in self.geometry.asked]
         found = [function.batch(*start, *end) for function in asked]

@@ -389,7 +389,7 @@ def holding(
         motions: motion of each phase, in order of time.
 
     Returns:
-        Forces of each phase, and a record of how the commanded forces were computed.
+        Forces of each phase, in this order; and a record of how the commanded forces were computed.
 
     Raises:
         SettingsError: the uncertainty leaves no friction or contact patch.

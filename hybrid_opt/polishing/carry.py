@@ -81,9 +81,9 @@ def local_minima_below(values: Array, limit: float, stride: int | None = None) -
 
     Args:
         values: (n,) values along the path.
-        limit: the limit.
-        stride: distance between further indices of each stretch, counted from its lowest value,
-            that are returned too; None for no further ones.
+        limit: upper limit of the values in a stretch.
+        stride: if given, further indices are returned in each stretch: those at multiples of this
+            distance from the lowest value.
     """
     below = values < limit
     if not below.any():
@@ -102,10 +102,11 @@ def local_minima_below(values: Array, limit: float, stride: int | None = None) -
 
 
 def interpolate_minima(clearance: Array) -> Array:
-    """Lower clearances to the minima that linear interpolation finds between places.
+    """Lower clearances at sampled places to the minima that are expected between the places.
 
     Where a body passes an edge, the clearance falls linearly to a kink and rises linearly after it.
-    The lines from both sides meet at the minimum, to which both neighbouring places are lowered.
+    The lines through the two places before and the two places after the kink, extended, meet at the
+    minimum. Both neighbouring places are lowered to it.
 
     Args:
         clearance: (n, k) clearances [m] of k pairs at n successive places.
@@ -144,8 +145,7 @@ class Distances:
         """Estimate the distance of each pair of bodies at n places from lower bounds; nothing is
         measured yet.
 
-        Near the minima along the path the bounds of close pairs are interpolated between the
-        places.
+        Bounds of close pairs are lowered by `interpolate_minima`.
 
         Args:
             bounds: (n, n_pairs) lower bounds of the distances [m].

@@ -175,8 +175,14 @@ class _StepAnswer:
     linear: LinearisedRows
 
     def multipliers_of(self, linear: LinearisedRows) -> Array:
-        """Return the multipliers (n + rows,) of the bounds and of other linearised rows of the same
-        program, 0 for rows that this solution did not have."""
+        """Return the multipliers (n + rows,) of the n bounds, then of the rows in `linear`.
+
+        The rows belong to the same quadratic program, but may differ from those of this solution.
+        Rows that this solution did not have get 0.
+
+        Args:
+            linear: linearised rows.
+        """
         timing = np.zeros(linear.shape)
         timing[self.linear.point, self.linear.kind] = self.answer.rows[: len(self.linear.point)]
         geometry = self.answer.rows[len(self.linear.point) :]
@@ -201,11 +207,13 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
     shrinks_below_step = relaxes_until_improved = True
 
     def __init__(self, cell: SmoothCell, is_coarse: bool = False) -> None:
-        """Prepare the programs of a cell.
+        """Compute from a cell what all steps share: bounds and scales of the path variables, the
+        grid of the timing, and the range of force limits.
 
         Args:
             cell: shared data of the polish.
-            is_coarse: True to move only the waypoints of the workcell file.
+            is_coarse: True to move only the waypoints of the workcell file; False to move the
+                intermediate waypoints too.
 
         Raises:
             SettingsError: the cell is not drivable, or its robust forces have no closed form.
@@ -258,7 +266,7 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
 
         Args:
             x: (n_var,) decision vector before the step.
-            d: (n_path,) change of the program's path variables.
+            d: (n_path,) change of the path variables of the quadratic program.
         """
         n, task = self._n, self.cell.task
         moved = x[:n] + self._spread @ d
@@ -388,21 +396,22 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         found: _StepAnswer | None = None,
         bent: Array | float = 0.0,
     ) -> _StepAnswer | None:
-        """Solve a quadratic model, and solve it again with the timing rows that the solution
-        violates.
+        """Solve the quadratic program of a step, and solve it again with the timing rows that the
+        solution violates.
 
-        A timing row is one limit at one point of the timing. Violated rows are added to `chosen` in
-        place.
+        A timing row is one limit at one point of the timing. Rows are added until none is violated.
 
         Args:
-            program: program of path and timing.
-            chosen: (points, kinds) mask of the timing rows in the model.
-            model: Hessian, and vector that is added to the objective's gradient.
+            program: path and timing about the iterate, linearised.
+            chosen: (points, kinds) mask of the timing rows that are included. Violated rows are
+                added to it in place.
+            model: Hessian (n, n) of the quadratic model, and vector (n,) that is added to the
+                objective's gradient.
             box: lower and upper bounds (n,) of the step.
-            found: solution of a similar model, in whose active set the solve starts; None to start
-                with the rows that are tight at the iterate.
-            bent: (geometric rows,) error of the rows' linear model along an earlier step, added to
-                the geometric rows.
+            found: solution of a similar quadratic program, in whose active set the solve starts.
+                None to start with the rows that are tight at the iterate.
+            bent: (geometric rows,) error of the geometric rows' linear model along an earlier step.
+                It is added to these rows.
 
         Returns:
             The last solution with its rows; None if there is no solution.
@@ -443,10 +452,10 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
     ) -> Residuals:
         """Compute the optimality residuals of an iterate with the multipliers of a step.
 
-        The variables' own bounds count as constraints; those of the trust region do not.
+        The variables' own bounds count as constraints; the bounds of the trust region do not.
 
         Args:
-            program: program of path and timing about the iterate.
+            program: path and timing about the iterate, linearised.
             best: the iterate.
             found: solution that contains the step and its multipliers.
         """

@@ -117,8 +117,9 @@ class Scalarisation:
         return float(np.max((phi - self.offset)[ahead] / self.direction[ahead]))
 
     def level(self, peak: Array) -> float:
-        """Return the objective cost . (a, phi_1, phi_2) of peak forces, with the least level a that
-        they allow.
+        """Return the scalarised objective of given peak forces: `cost` times (a, phi_1, phi_2).
+
+        Here phi_1 and phi_2 are the scaled peak forces, and a is the least level that they allow.
 
         Args:
             peak: (2,) peak force of each robot over its reference force.
@@ -209,10 +210,10 @@ class ForceProgram:
         x: Array,
         radius: float,
     ) -> None:
-        """Form the program around a candidate.
+        """Form the nonlinear program of a step from a candidate.
 
         Args:
-            cell: shared data of the cell's programs.
+            cell: data that all nonlinear programs of the cell share.
             required: value that each row (scalar inequality) has to exceed; for force rows it is
                 not used.
             target: the scalarisation that is minimised.

@@ -152,12 +152,17 @@ class IntervalGrid:
         self.variables = self.layout.variables
 
     def by_path(self, slope: Array, points: NDArray[np.intp]) -> Array:
-        """Convert derivatives by the extended pose (box pose and redundant joints) and its two path
-        derivatives to derivatives (rows, n_path) by the program's path variables.
+        """Convert derivatives by the extended pose and its two derivatives by u to derivatives by
+        the path variables of the quadratic program.
+
+        The extended pose is the box pose followed by the redundant joints.
 
         Args:
             slope: (rows, moving) derivatives of one value per row.
             points: (rows,) index of each row's point.
+
+        Returns:
+            (rows, n_path) derivatives.
         """
         rows, columns = self.workcell.task.free_entries
         at = self.sample[points]
@@ -199,15 +204,15 @@ class IntervalValues:
         squared: Array,
         near: tuple[Array, Array],
     ) -> None:
-        """Evaluate the quantities.
+        """Evaluate the limited quantities at the points of a timing.
 
         Args:
-            grid: shared data.
+            grid: data that all evaluations share.
             functions: compiled functions of the polish.
             waypoints: (n_waypoints, 6 + m) box poses followed by m redundant joints [m, rad].
             squared: (intervals + 1,) u'^2 at the grid points [1/s^2].
-            near: (intervals + 1, n) for each arm, joint positions near those that hold the box
-                [rad].
+            near: joint positions of each arm at the grid points, (intervals + 1, n) [rad]. They are
+                close to the positions that hold the box.
         """
         self._grid, self._functions = grid, functions
         path, s, threads = grid.path(waypoints), grid.sample, grid.threads
@@ -266,14 +271,14 @@ class IntervalValues:
         return np.asarray(self.value @ self._grid.kinds.mix.T)
 
     def curvature(self, weight: Array) -> tuple[NDArray[np.intp], Array]:
-        """Compute the Hessian of weight . value at each point.
+        """Compute the Hessian of the weighted sum of all limited quantities at each point.
 
         Args:
             weight: (points, quantities) weights. Robust forces get the curvature of planned ones.
 
         Returns:
             Indices (m,) of the points with a nonzero weight, and their Hessians (m, moving + 2,
-            moving + 2).
+            moving + 2) by the extended pose, its two derivatives by u, u'' and u'^2.
         """
         if self._grid.robust is not None:
             weight = self._grid.robust.planned_weights(weight, self.value)
@@ -336,16 +341,17 @@ def _by_load(pressed: Mapping[str, Array], slope: Array) -> Array:
 
 
 def _followed(grid: IntervalGrid, full: Array, follow: Sequence[Array]) -> Array:
-    """Eliminate the joints from derivatives, because the joints follow the pose.
+    """Eliminate the joint positions from derivatives, because the joints follow the extended pose
+    (box pose and redundant joints).
 
     Args:
-        grid: shared data.
+        grid: data that all evaluations share.
         full: (points, quantities, variables) derivatives by all variables of a point.
-        follow: for each arm, derivatives (points, pose, n) of its n joints by the extended pose
-            (box pose and redundant joints).
+        follow: for each arm, derivatives (points, pose, n) of its n joint positions by the extended
+            pose.
 
     Returns:
-        (points, quantities, moving + 2) derivatives by the extended pose, its two path derivatives,
+        (points, quantities, moving + 2) derivatives by the extended pose, its two derivatives by u,
         u'' and u'^2.
     """
     slope = np.concatenate([full[:, :, : grid.moving], full[:, :, -2:]], axis=2)
@@ -432,15 +438,16 @@ class PathTimingProgram:
         required: Mapping[Row, float],
         carry: PlacedCarry,
     ) -> None:
-        """Form the program about an iterate.
+        """Linearise the duration and the geometric rows about an iterate.
 
         Args:
-            grid: shared data of the workcell's programs.
+            grid: data that all quadratic programs of the workcell share.
             values: limited quantities of the iterate.
             x: (n_var,) decision vector of the iterate, the force limit last.
             squared: (intervals + 1,) squared path speeds u'^2 of the iterate [1/s^2].
             cell: shared data of the polish.
-            required: value that each geometric row has to exceed.
+            required: value that each geometric row (scalar inequality at a place of the path) has
+                to exceed.
             carry: the iterate at places of the path.
         """
         self._grid, self._values, self._x, self._force = grid, values, x, float(x[-1])
@@ -583,7 +590,7 @@ class PathTimingProgram:
         self._known[point, kind] = True
 
     def gradient(self) -> Array:
-        """Return the gradient (n,) of the objective T / T_0."""
+        """Return the gradient (n,) of the objective: the duration over the duration of the iterate."""
         return np.concatenate([np.zeros(self.n_path), self.cost])
 
     def gain(self, d: Array) -> float:

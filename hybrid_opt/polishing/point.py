@@ -262,15 +262,16 @@ class StepMethod(ABC, Generic[AnyIterate, AnyStep]):
     def propose_step(
         self, best: AnyIterate, required: Mapping[Row, float], radius: float
     ) -> AnyStep | None:
-        """Propose a step by a program about the best iterate.
+        """Propose a step from the best iterate, by solving an optimisation problem with linear or
+        smooth models.
 
         Args:
             best: the best iterate so far.
-            required: value that each row (scalar inequality) of the program has to exceed.
+            required: value that each row (scalar inequality) has to exceed.
             radius: half the width of the trust region [half ranges of the variables].
 
         Returns:
-            The step; None if the program has no solution.
+            The step; None if the optimisation problem has no solution.
         """
 
     @abstractmethod
@@ -299,8 +300,8 @@ class StepMethod(ABC, Generic[AnyIterate, AnyStep]):
         """
 
     def missing_rows(self, trial: AnyIterate) -> set[Row]:
-        """Return rows (scalar inequalities) that a program should have contained, found at the
-        candidate after its step.
+        """Return rows (scalar inequalities) that the optimisation problem of a step should have
+        contained.
 
         The method is called after a step that violated nothing but did not improve.
 

@@ -109,9 +109,10 @@ class RobustForces:
         derivatives.
 
         Args:
-            path: box poses followed by redundant joints, and their first and second derivatives by
-                the path parameter u, (points, pose) each.
-            a, w: (points,) path acceleration u'' and squared path speed u'^2 [1/s^2].
+            path: box pose followed by redundant joints, and its first and second derivative by the
+                path parameter u, (points, pose) each.
+            a: (points,) path acceleration u'' [1/s^2].
+            w: (points,) squared path speed u'^2 [1/s^2].
 
         Returns:
             Forces (points, ROBUST_ROWS) [N], and their derivatives (points, ROBUST_ROWS, 3 pose +

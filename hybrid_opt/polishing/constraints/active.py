@@ -94,8 +94,9 @@ class RowSelector:
         Args:
             carry: candidate after the step.
             known: candidate before the step.
-            program_rows: rows of the program that proposed the step. Force rows among these never
-                count as violated, because a force above its peak only raises the peak.
+            program_rows: rows of the optimisation problem whose solution is the step. Force rows
+                among these never count as violated, because a force above its peak only raises the
+                peak.
         """
         rows = set[Row]()
         for kind in self._kinds.values():
@@ -129,11 +130,12 @@ class RowSelector:
     def required_values(
         self, carry: PlacedCarry, rows: Iterable[Row], is_relaxed: bool = False
     ) -> dict[Row, float]:
-        """Return the bound that each row (scalar inequality) has to exceed in the next program.
+        """Return the value that each row (scalar inequality) has to exceed in the optimisation
+        problem of the next step.
 
         Args:
-            carry: the candidate about which the program is formed.
-            rows: rows of the program.
+            carry: the candidate from which the step starts.
+            rows: rows of this optimisation problem.
             is_relaxed: True to require no larger distance between bodies than the candidate has.
         """
         values: dict[Row, float] = {}
@@ -209,15 +211,15 @@ class WorkingSet:
         return {*self._tightened, *self._active_for}
 
     def tighten(self, required: dict[Row, float], x: Array, radius: float) -> None:
-        """Raise the required values of tightened rows (scalar inequalities), in place, by a share
-        of their tightening.
+        """Raise the values that tightened rows (scalar inequalities) have to exceed in the next
+        step.
 
-        The share is the trust region's radius over the distance to the candidate at which the row
-        was tightened, at most one.
+        Each is raised by a share of the row's tightening: the trust region's radius over the
+        distance to the candidate at which the row was tightened, at most one.
 
         Args:
-            required: value that each row of the next program has to exceed, which is changed.
-            x: decision vector about which the next program is formed; its first n entries are the
+            required: value that each row has to exceed, changed in place.
+            x: decision vector from which the next step starts; its first n entries are the
                 variables that steps change.
             radius: radius of the trust region [half ranges of the variables].
         """
@@ -249,19 +251,21 @@ class WorkingSet:
         return is_new
 
     def add(self, rows: Iterable[Row], x: Array) -> None:
-        """Add rows (scalar inequalities) that a program lacked, without tightening their bounds.
+        """Add rows (scalar inequalities) that the optimisation problem of a step lacked, without
+        tightening their bounds.
 
         Args:
             rows: the missing rows.
-            x: (n_var,) decision vector to which the step of this program led.
+            x: (n_var,) decision vector after the step.
         """
         self._tightened.update(dict.fromkeys(rows, (-np.inf, x)))
 
     def mark_active(self, rows: Iterable[Row]) -> None:
-        """Keep rows (scalar inequalities) in the next `ACTIVE_ROW_LIFETIME` programs.
+        """Keep rows (scalar inequalities) in the optimisation problems of the next
+        `ACTIVE_ROW_LIFETIME` steps.
 
         Args:
-            rows: rows that have a nonzero multiplier in the last program.
+            rows: rows that have a nonzero multiplier in the last step.
         """
         left = {row: count - 1 for row, count in self._active_for.items() if count > 1}
         self._active_for = left | dict.fromkeys(rows, ACTIVE_ROW_LIFETIME)

@@ -106,11 +106,11 @@ class ConstraintKind(ABC, Generic[AnyRow]):
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[AnyRow], is_relaxed: bool = False
     ) -> list[float]:
-        """Return the bound that each row (scalar inequality) has to exceed in a program about a
-        candidate.
+        """Return the value that each row (scalar inequality) has to exceed in the optimisation
+        problem of a step.
 
         Args:
-            carry: the candidate, evaluated at places of the path.
+            carry: the candidate from which the step starts, evaluated at places of the path.
             rows: the rows.
             is_relaxed: True to require no larger distance between bodies than the candidate has.
         """

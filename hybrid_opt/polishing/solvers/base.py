@@ -139,12 +139,13 @@ parameter."""
 def optimality_residuals(
     program: NonlinearProgram, z: Array, bounds: tuple[Array, Array] | None = None
 ) -> Residuals:
-    """Compute the optimality residuals of a program at z with least-squares multipliers.
+    """Compute the optimality residuals of a nonlinear program at z with least-squares multipliers.
 
     Args:
-        program: the program.
+        program: the nonlinear program.
         z: (n_variables,) variables.
-        bounds: lower and upper bounds (n_variables,) each; None for the program's.
+        bounds: lower and upper bounds of the variables, (n_variables,) each; None for the program's
+            own.
     """
     low, high = bounds or (program.low, program.high)
     rows, slopes = program.rows(z)
@@ -156,15 +157,16 @@ def optimality_residuals(
 def residuals(
     program: NonlinearProgram, z: Array, at_bounds: Array, y: Array, bounds: tuple[Array, Array]
 ) -> Residuals:
-    """Compute the residuals of a program's optimality conditions at z with given multipliers.
+    """Compute the residuals of the optimality conditions of a nonlinear program at z with given
+    multipliers.
 
     Args:
-        program: the program.
+        program: the nonlinear program.
         z: (n_variables,) variables.
         at_bounds: (n_variables,) multipliers of the bounds, positive for upper and negative for
             lower ones.
         y: (n_rows,) multipliers of the rows.
-        bounds: lower and upper bounds (n_variables,) each.
+        bounds: lower and upper bounds of the variables, (n_variables,) each.
     """
     (low, high), (rows, slopes) = bounds, program.rows(z)
     lagrangian = program.cost - slopes.T @ y + at_bounds
@@ -186,12 +188,12 @@ def estimate_multipliers(
     Args:
         cost: (n,) gradient of the objective.
         A: (m, n) gradients of the inequalities.
-        slacks: slacks of the inequalities (m,), of the lower bounds (n,) and of the upper bounds
-            (n,).
+        slacks: distances from equality: of the m inequalities (m,), of the lower bounds (n,) and of
+            the upper bounds (n,).
 
     Returns:
-        Multipliers of the bounds (n,), positive for upper and negative for lower ones, and of the
-        inequalities (m,), nonnegative.
+        Multipliers (n,) of the bounds, positive for upper and negative for lower ones; then
+        multipliers (m,) of the inequalities, nonnegative.
     """
     # Not imported at the top: it takes long, and records of polishes are read without it.
     from scipy.optimize import nnls

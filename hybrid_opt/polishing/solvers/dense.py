@@ -31,10 +31,10 @@ from hybrid_opt.polishing.solvers.base import (
 
 
 def dense(program: NonlinearProgram, iterations: int, barrier: float) -> Answer:
-    """Solve a program by the dense interior-point method.
+    """Solve a nonlinear program by the dense interior-point method.
 
     Args:
-        program: the program.
+        program: the nonlinear program.
         iterations: number of iterations after which the solve stops at the next feasible iterate.
         barrier: first weight of the logarithmic barrier.
 

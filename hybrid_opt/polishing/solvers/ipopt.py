@@ -90,18 +90,18 @@ class _Callback(ca.Callback):  # type: ignore[misc]  # CasADi has no types
 
 
 def _functions(program: NonlinearProgram, wanted: int) -> tuple[_Callback, dict[str, _Callback]]:
-    """Convert a program to the functions that CasADi's `nlpsol` takes.
+    """Convert a nonlinear program to the functions that CasADi's `nlpsol` takes.
 
-    The solve stops at the first feasible iterate after the wanted number of iterations. Stopped at
-    an arbitrary iterate, it usually ends in an obstacle.
+    The stopping rule ends the solve at the first feasible iterate after the wanted number of
+    iterations. An arbitrary iterate usually lies in an obstacle.
 
     Args:
-        program: the program.
-        wanted: the wanted number of iterations.
+        program: the nonlinear program.
+        wanted: number of iterations after which the solve may stop.
 
     Returns:
-        Objective and rows as one function; derivatives and stopping rule by the names of nlpsol's
-        options.
+        - One function of the variables, whose outputs are the objective and the rows.
+        - Functions for the derivatives and the stopping rule, by the names of nlpsol's options.
     """
     n, m, iterations = len(program.start), len(program.values(program.start)), 0
     x, p, g = ca.Sparsity.dense(n), ca.Sparsity(0, 0), ca.Sparsity.dense(m)
@@ -137,10 +137,10 @@ def _functions(program: NonlinearProgram, wanted: int) -> tuple[_Callback, dict[
 
 
 def ipopt(program: NonlinearProgram, iterations: int, barrier: float) -> Answer:
-    """Solve a program with IPOPT.
+    """Solve a nonlinear program with IPOPT.
 
     Args:
-        program: the program.
+        program: the nonlinear program.
         iterations: number of iterations after which the solve stops at the next feasible iterate.
         barrier: first weight of the logarithmic barrier.
     """

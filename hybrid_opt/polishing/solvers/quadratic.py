@@ -64,8 +64,12 @@ class QuadraticAnswer:
     bounds: Array
 
     def satisfies_optimality(self, program: QuadraticProgram) -> bool:
-        """Return True if the answer satisfies the optimality conditions of a program, recomputed
-        here."""
+        """Return True if this answer satisfies the optimality conditions of a quadratic program,
+        which are recomputed here.
+
+        Args:
+            program: the quadratic program.
+        """
         if not all(np.isfinite(part).all() for part in (self.d, self.rows, self.bounds)):
             return False
         bend, pull = program.H @ self.d, self.rows @ program.A
@@ -83,16 +87,16 @@ class QuadraticAnswer:
 
 
 def solve_quadratic(program: QuadraticProgram, start: Array) -> QuadraticAnswer | None:
-    """Solve a program by DAQP.
+    """Solve a quadratic program with the solver DAQP.
 
     Args:
-        program: the program.
-        start: (n + rows,) multipliers of the bounds, then of the rows, of a similar program. The
-            solve begins with those active whose multiplier is not 0.
+        program: the quadratic program.
+        start: (n + rows,) multipliers of the n bounds, then of the rows, from a similar quadratic
+            program. Constraints whose multiplier is not 0 are active at the start.
 
     Returns:
-        The solution; None if the program is infeasible, or if DAQP's answer does not satisfy the
-        optimality conditions.
+        The solution; None if the quadratic program is infeasible, or if DAQP's answer does not
+        satisfy the optimality conditions.
     """
     n = len(program.g)
     # DAQP itself would change to these variables z = L^T d, where H = L L^T, more slowly.
@@ -117,12 +121,13 @@ def solve_quadratic(program: QuadraticProgram, start: Array) -> QuadraticAnswer 
 def convexify(H: Array, A: Array, b: Array) -> tuple[Array, Array]:
     """Return a convex quadratic model of a Lagrangian.
 
-    The model agrees with the Lagrangian where the active rows are equalities, because it adds their
-    squares (A d - b)^2. Eigenvalues that are then still negative are raised.
+    The squares (A d - b)^2 of the active rows are added, so the model equals the Lagrangian for all
+    steps d with A d = b. Eigenvalues that are then still negative are raised.
 
     Args:
         H: (n, n) Hessian of the Lagrangian.
-        A, b: matrix (rows, n) and right side (rows,) of the active rows A d <= b.
+        A: (rows, n) matrix of the active rows A d <= b.
+        b: (rows,) right side of the active rows.
 
     Returns:
         Positive definite Hessian (n, n) of the model, and the vector (n,) that the squares add to
