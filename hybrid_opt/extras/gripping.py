@@ -131,8 +131,8 @@ def propose_grip(
 
 
 def _ways(workcell: Workcell) -> Array:
-    """Compute the directions along the pads' faces in the box frame (2, 3): upwards at the start,
-    then level.
+    """Compute two unit vectors along the pads' faces in the box frame, (2, 3): the first points
+    upwards at the start, the second is level.
 
     Args:
         workcell: the cell.

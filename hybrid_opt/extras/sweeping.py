@@ -266,10 +266,8 @@ _LOADED: dict[tuple[Any, ...], Cell] = {}
 
 
 def _loaded(cell: Cell) -> Cell:
-    """Return the cell of an earlier call in this process that equals the given one, else the given
-    one.
-
-    So the functions of a cell are loaded once.
+    """Return a cell whose functions are already loaded, if an earlier call in this process was
+    given an equal cell; otherwise the given cell.
 
     Args:
         cell: the cell.

@@ -590,7 +590,7 @@ class PathTimingProgram:
         self._known[point, kind] = True
 
     def gradient(self) -> Array:
-        """Return the gradient (n,) of the objective: the duration over the duration of the iterate."""
+        """Return the gradient (n,) of the objective: duration over the duration of the iterate."""
         return np.concatenate([np.zeros(self.n_path), self.cost])
 
     def gain(self, d: Array) -> float:

@@ -59,11 +59,11 @@ def nominal_case(workcell: Workcell) -> Array:
 
 
 def worst_cases(contact: ContactModel, uncertainty: Uncertainty, leader: int = 0) -> Array:
-    """Return the worst cases (k, 18) of an uncertainty. The largest squeeze (pair of opposite
-    normal forces) that one of them needs holds the box in every case within the ranges.
+    """Return the worst cases (k, 18) of an uncertainty.
 
-    Each row states true values of friction, mass and the other uncertain quantities, laid out by
-    `symbolic.contact.worst_cases.CASE_SIZES`.
+    A squeeze (pair of opposite normal forces) that holds the box in all of these cases holds it in
+    every case within the ranges. Each row states friction, mass and the other uncertain quantities,
+    in the order of `symbolic.contact.worst_cases.CASE_SIZES`.
 
     Args:
         contact: contact model of the workcell's commanded forces.
@@ -217,9 +217,9 @@ def governing_cases(
         worst: (k, n, 2) least normal forces of both robots in k cases at n samples [N].
         uncertainty: ranges of the uncertain quantities.
         leader: index of the position-controlled arm.
-        difference: (k, n) leading force minus `leading_share` times commanded force [N]; None to
-            take it from `worst`.
-        leading_share: rise of the leading arm's force per newton of commanded force.
+        difference: (k, n) normal force of the position-controlled arm minus `leading_share` times
+            the commanded force [N]; None to compute it from `worst`.
+        leading_share: rise of the position-controlled arm's force per newton of commanded force.
     """
     follower, every = 1 - leader, np.arange(worst.shape[1])
     if difference is None:

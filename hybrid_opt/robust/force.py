@@ -352,9 +352,8 @@ class RobustModel:
 
     @cached_property
     def leading_share(self) -> Array:
-        """(2,) rise of the leading arm's force per newton of commanded force: entry i if arm i
-        leads.
-        """
+        """Rise of the position-controlled arm's normal force per newton of commanded force, (2,):
+        element i holds if arm i is position-controlled."""
         return self._contact.leading_share
 
     def hold(

@@ -233,9 +233,10 @@ def comment(text: str) -> str:
 
 
 def prefixes(workcell: Workcell) -> tuple[str, str]:
-    """Return, for each robot, the prefix of its links' and joints' names in ROS.
+    """Return the prefix of the links' and joints' names in ROS, of the first robot and of the
+    second.
 
-    Both are '' if the robots are arms of one machine.
+    Both prefixes are '' if the robots are arms of one machine.
 
     Args:
         workcell: the cell.

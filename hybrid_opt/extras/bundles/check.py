@@ -441,11 +441,11 @@ def _held(along: Array, across: Array) -> Mask:
     each other.
 
     Args:
-        along: (n,) error of the distance between the pads along the normal [m].
-        across: (n,) displacement of one pad against the other across the normal [m].
+        along: (n,) distance between the pads along the normal, minus the planned distance [m].
+        across: (n,) displacement of the second pad across the normal [m].
 
     Returns:
-        (n,) True for samples of this run.
+        (n,) True for samples of this run; False everywhere if no run has `SHORTEST` samples.
     """
     near = (np.abs(along) < TOUCHING) & (across < TOUCHING)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], near.astype(int), [0]])))

@@ -156,15 +156,16 @@ def between(time: Array, known: Sequence[Array], interpolation: Interpolation) -
 
 
 def pad_errors(workcell: Workcell, q: Array) -> tuple[Array, Array]:
-    """Compute the deviation of the second pad from its planned place relative to the first pad.
+    """Compute how far the second pad is from its planned place relative to the first pad.
 
     Args:
         workcell: the cell.
         q: (n, joints) joint positions of both arms side by side [rad or m].
 
     Returns:
-        (n,) distance between the pads along the first pad's normal minus the planned distance [m],
-        and (n,) displacement across this normal [m].
+        - Distance (n,) between the pads along the first pad's normal, minus the planned distance
+          [m].
+        - Displacement (n,) across this normal, at least zero [m].
     """
     first = len(workcell.robots[0].torque_max)
     T = [pad_places(workcell, arm, own) for arm, own in enumerate((q[:, :first], q[:, first:]))]
@@ -375,9 +376,11 @@ class Export:
 
     @property
     def joint_columns(self) -> dict[str, Array]:
-        """Arrays (n, joints) of both arms side by side, by name: joint positions, velocities,
-        accelerations [rad or m, and s], and torques with and without gravity [N m, for sliding
-        joints N]."""
+        """Arrays (n, joints) by name, with the joints of both arms side by side.
+
+        They are joint positions [rad or m], velocities and accelerations [per s, per s^2], and
+        torques with and without gravity [N m, for sliding joints N].
+        """
         sampled = self.sampled
         return {
             "position": sampled.q,

@@ -431,16 +431,17 @@ def places_of(workcell: Workcell, run: Recording) -> Places:
 
 
 def tared(run: Recording, places: Places) -> tuple[Places, Array]:
-    """Subtract the sensors' offsets from the wrenches of a run. The offset of a sample is the
-    offset measured at the last tare before the sample.
+    """Subtract the force sensors' offsets from the wrenches of a run.
+
+    The offset of a sample is the one measured at the last tare before it.
 
     Args:
         run: the run, whose labels state the tares.
-        places: poses and wrenches of the run.
+        places: pad poses and wrenches of the run.
 
     Returns:
-        The places with corrected wrenches; and the offset of each arm at each of the k recorded
-        tares (k, 2, 6) [N, N m].
+        - The pad poses with corrected wrenches.
+        - Offsets (k, 2, 6) of both arms at each of the k recorded tares [N, N m].
     """
     instants = [instant for instant in sorted(run.labels.tare) if run.around(instant).any()]
     if not instants:

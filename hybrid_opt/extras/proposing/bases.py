@@ -84,8 +84,9 @@ POSES = 33
 
 
 def base_choices(problem: Problem, spins: Array, rng: np.random.Generator) -> list[dict[str, Any]]:
-    """Propose bases for both robots, the most promising pair first. Both arms of a two-armed
-    machine get the same base.
+    """Propose bases for both robots, the most promising pair first.
+
+    Both arms of a two-armed machine get the same base.
 
     Args:
         problem: the problem.
@@ -93,8 +94,8 @@ def base_choices(problem: Problem, spins: Array, rng: np.random.Generator) -> li
         rng: generator of random postures.
 
     Returns:
-        Keys to add to the tables of the problem file (robots and contacts), one dictionary per pair
-        of bases.
+        One dictionary per pair of bases: by name of the table of the problem file (robots and
+        contacts), the keys to add to it.
     """
     found: list[tuple[float, dict[str, Any]]] = []
     for side in problem.sides():

@@ -73,14 +73,14 @@ class Draft:
 
 
 def changes(problem: Problem, found: Draft) -> dict[str, Any]:
-    """Return the keys that turn a problem file into a workcell file with a found path.
+    """Return what turns a problem file into a workcell file with a found path.
 
     Args:
         problem: the problem.
         found: the path, with its cell.
 
     Returns:
-        New keys and values by table of the file: `task`, `robots` and `contacts`.
+        New keys and values for the tables `task`, `robots` and `contacts`, by name of the table.
     """
     poses = readable_turns(found.waypoints[:, :POSE_SIZE], found.workcell.task.orientation)
     waypoints = np.hstack([poses, found.waypoints[:, POSE_SIZE:]])

@@ -369,16 +369,17 @@ class _Finder:
     def _followed(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
         """Move the arm from n postures along given poses of its last joint.
 
-        Of an arm with redundant joints, about half of the postures keep these joints; the others
-        move them at an even rate to random positions.
+        If the arm has redundant joints, these stay fixed for about half of the postures. For the
+        other postures they move at an even rate to random positions.
 
         Args:
             targets: (m, n, 4, 4) poses of the last joint in the world, m for each posture.
             q: (n, joints) postures at the first pose [rad or m].
 
         Returns:
-            Indices of the postures that reach the last pose; joint paths (m, n, joints) [rad or m];
-            scores (n,), larger is better.
+            - Indices of the postures that reach the last pose.
+            - Joint paths (m, n, joints) of all postures [rad or m].
+            - Scores (n,) of all postures, larger is better.
         """
         kinematics, redundant = self.kinematics, list(self.kinematics.redundant)
         ends = None

@@ -127,8 +127,8 @@ class ArmKinematics:
             q: (n, joints) joint positions [rad or m].
 
         Returns:
-            Origin [m] and unit axis of every joint side by side (n, joints, 6), and the pose (n, 4,
-            4) of the last joint's frame.
+            - (n, joints, 6) origin [m] of every joint, followed by its unit axis, world frame.
+            - (n, 4, 4) pose of the last joint's frame in the world.
         """
         n, arm = len(q), self.geometry
         T = np.broadcast_to(arm.T_world_root, (n, 4, 4))
@@ -238,11 +238,12 @@ class ArmKinematics:
             ends: (n, redundant) positions of the redundant joints at the last pose [rad or m],
                 reached at an even rate; None if they do not move.
             resolved: True if redundant joints move freely, near the middle of their ranges. Joints
-                that also move the other arm then follow `ends`, or move freely if that is None.
+                that also move the other arm then follow `ends`; they move freely if `ends` is None.
 
         Returns:
-            Joint paths (m, n, joints) [rad or m]; number (n,) of poses that each posture reaches
-            before a joint jumps; manipulability (m, n) [m^3], negative beyond a singular posture.
+            - Joint paths (m, n, joints) [rad or m].
+            - Number (n,) of poses that each posture reaches before a joint jumps.
+            - Manipulability (m, n) [m^3], negative beyond a singular posture.
         """
         m, n = len(targets), len(q)
         path, measure = np.tile(q, (m, 1, 1)), np.zeros((m, n))

@@ -88,13 +88,13 @@ class Problem:
 
     @cached_property
     def contacts(self) -> list[dict[str, Any]]:
-        """File entries (keys and values) of both contacts, with the places of pads or hands on the
-        box.
+        """The two tables of contacts as they stand in a file, with the places of pads or hands on
+        the box.
 
-        Places in the file are kept. Otherwise hands that hold by themselves are placed at the first
+        Places in the file are kept. Otherwise hands that grip by themselves are placed at the first
         of `hand_places`, and pads at the centres of the two opposite faces that face the robots'
-        bases or a machine's shoulders. Without bases in the file, these are the faces beside the
-        direction of the carry.
+        bases or a machine's shoulders. Without bases in the file, pads are placed on the faces
+        beside the direction of the carry.
 
         Raises:
             WorkcellError: the file describes robots whose shoulders cannot be found, or no face has
@@ -131,8 +131,8 @@ class Problem:
 
     @cached_property
     def _hand_places(self) -> list[list[dict[str, Any]]]:
-        """File entries of both contacts for each proposed placement of the arms' hands, the best
-        first.
+        """The two tables of contacts as they stand in a file, for each proposed placement of the
+        arms' hands; the best first.
 
         Raises:
             WorkcellError: the file is wrong, or no face has room for the hands.
@@ -166,14 +166,14 @@ class Problem:
         return found
 
     def other_contacts(self) -> list[list[dict[str, Any]]]:
-        """Return other placements of the pads or hands on the box, the most promising first.
+        """Return further placements of the pads or hands on the box, the most promising first.
 
         For pads these are all pairs of opposite faces: upright faces first, then those that face
         the robots.
 
         Returns:
-            File entries of both contacts, for each placement; empty if the file states the places
-            or has no bases.
+            For each placement the two tables of contacts as they stand in a file; an empty list if
+            the file states the places or has no bases.
         """
         if self._bases is None or all("xyz" in entry for entry in self.data["contacts"]):
             return []

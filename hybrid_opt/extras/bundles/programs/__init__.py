@@ -42,6 +42,6 @@ def programs(name: str) -> dict[str, str]:
         name: file name of the program.
 
     Returns:
-        Texts of the files by path.
+        Text of each file, by its path in the bundle.
     """
     return {each: program(each) for each in (name, *SHARED)}

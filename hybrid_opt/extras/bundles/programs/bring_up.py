@@ -240,7 +240,7 @@ class Looks:
             lag: delay of the arm behind its commands [s].
 
         Returns:
-            The attribute `sign` of `Measured`, and either `stiffness` or `press`.
+            Values of attributes of `Measured` by name: `sign`, and either `stiffness` or `press`.
 
         Raises:
             Refused: no force was measured.
@@ -300,17 +300,19 @@ def add_options(parser: ArgumentParser) -> None:
 def bring_up(
     folder: Path, job: Job, plan: dict[str, Any], drive: Callable[[Job, str], bool], looks: Looks
 ) -> int:
-    """Measure both arms and write the results into a bundle's folder. Return the exit code of the
-    program.
+    """Measure both arms and write the results into a bundle's folder.
 
     Args:
         folder: folder of the bundle.
         job: the job.
-        plan: planned values, as in the configuration of the bundle.
+        plan: planned values, as `plan` in the bundle's configuration.
         drive: function that takes a job and a word. It waits until somebody types the word, runs
-            the job to its end and back, stores measurements in `looks`, and returns True if the run
-            was completed.
+            the job to its end and back, and stores measurements in `looks`. It returns True if the
+            run was completed.
         looks: store of the measurements.
+
+    Returns:
+        Exit code of the bring-up program.
 
     Raises:
         Refused: a measurement fails.

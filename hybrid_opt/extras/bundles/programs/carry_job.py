@@ -351,16 +351,17 @@ class Job:
         window: tuple[float, float],
         near: float = NEAR,
     ) -> float:
-        """Find the planned time at which an arm's planned posture is nearest to a measured one [s].
-        Of equally near ones the time nearest to s is returned.
+        """Find the planned time [s] at which an arm's planned posture is nearest to a measured one.
+
+        Of equally near times the one nearest to `s` is returned.
 
         Args:
             arm: index of the arm.
             q: measured joint positions [rad or m].
             s: planned time around which to search [s].
-            window: least and largest difference of the result from s [s].
-            near: if the pad is at most this far from its planned place at s, s itself is returned
-                [m].
+            window: range of the search, as the least and the largest value of result minus `s` [s].
+            near: distance [m]. If the pad is at most this far from its planned place at `s`, the
+                result is `s` itself.
         """
         if self.distance(arm, q, s) <= near:
             return s

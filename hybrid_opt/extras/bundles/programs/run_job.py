@@ -257,14 +257,14 @@ class Run:
             rclpy.spin_once(self.node, timeout_sec=left)
 
     def wait(self, futures: Sequence[Any], what: str) -> list[Any]:
-        """Wait for futures and return their results, in the same order.
+        """Wait for ROS futures and return their results, in the same order.
 
         Args:
             futures: the futures.
-            what: name of what is awaited, for the message.
+            what: text for the error message that names what is awaited.
 
         Raises:
-            Refused: they take longer than `PATIENCE`.
+            Refused: the results take longer than `PATIENCE`.
         """
         begin = self.now()
         while not all(future.done() for future in futures):
@@ -274,16 +274,17 @@ class Run:
         return [future.result() for future in futures]
 
     def call(self, name: str, kind: str, requests: Sequence[dict[str, Any]]) -> Any:
-        """Call a service. A refusal is reported as a fault when it arrives.
+        """Call a ROS service, without waiting for its answer. A refusal is reported as a fault when
+        it arrives.
 
         Args:
             name: name of the service.
             kind: type of the service.
-            requests: the same request in the forms of several versions of the driver; the first
-                form that fits is sent.
+            requests: fields of one request by name, once for each version of the driver; the first
+                that fits the service's type is sent.
 
         Raises:
-            Refused: no form fits.
+            Refused: none of the requests fits.
         """
         for request in requests:
             message = type_of(kind).Request()
