@@ -105,14 +105,15 @@ def check_search_timing(model: TimingModel, x: Array) -> Timing:
 
 
 def _jump(model: TimingModel, carry: Carry) -> Place | None:
-    """Return the place of a jump of the joint speeds at the start or end of a carry.
-
-    The place names the joint that is fastest there, relative to its speed limit. None if all joints
-    start and end at rest.
+    """Find the joint whose speed jumps most at the start or end of a carry, relative to its speed
+    limit.
 
     Args:
         model: timing model of the workcell.
         carry: the carry.
+
+    Returns:
+        The joint and the end of the carry; None if all joints start and end at rest.
     """
     limit = model.workcell.stack_joint_limits("velocity_max")
     ends = np.abs(carry.stack_arms("q_rate")[[0, -1]]) / limit

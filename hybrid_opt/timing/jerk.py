@@ -161,13 +161,8 @@ class _JerkProblem:
         return replace(self._checked_timing(c), rounds=rounds)
 
     def _iterate(self, c: Array) -> tuple[Array, int]:
-        """Solve a sequence of convex programs until the duration settles.
-
-        Args:
-            c: (k,) spline coefficients of the squared speed that satisfy all limits.
-
-        Returns:
-            The last coefficients (k,), and the number of convex programs solved.
+        """Solve convex programs from feasible spline coefficients c (k,) of the squared speed until
+        the duration settles. Return the last coefficients (k,) and the number of programs solved.
         """
         duration = self._coarse.duration(c)
         for rounds in range(1, MAX_JERK_ITERATIONS + 1):
@@ -181,14 +176,11 @@ class _JerkProblem:
         return c, rounds
 
     def _step(self, c: Array) -> Array | None:
-        """Solve one convex program, linearised at given spline coefficients.
-
-        Args:
-            c: (k,) spline coefficients of the squared speed.
+        """Solve one convex program, linearised at spline coefficients c (k,) of the squared speed.
 
         Returns:
             Coefficients (k,) with a shorter duration that satisfy all limits at the coarse points;
-            None if the convex program has no solution.
+            None if the program has no solution.
         """
         at, rows = self._coarse, JerkProgram(len(c))
         self._motion_rows(rows)
@@ -245,12 +237,8 @@ class _JerkProblem:
     def _jerk_rows(self, c: Array, rows: JerkProgram) -> None:
         """Add limits on the jerks of joints and payload to the convex program `rows`.
 
-        With the squared speed v, jerk / sqrt(v) is linear in the spline coefficients of v. Its
-        upper bound, limit / sqrt(v), is replaced by the tangent at given coefficients.
-
-        Args:
-            c: (k,) spline coefficients at which the tangent is taken.
-            rows: convex program that gets the rows.
+        With the squared speed v, jerk / sqrt(v) is linear in the spline coefficients. Its bound,
+        limit / sqrt(v), is replaced by the tangent at the coefficients c (k,).
         """
         at, jerk, v = self._coarse, self._jerk, self._coarse.value @ c
         # Multiplied by sqrt(v) of the last round, so that rows are of order one.
@@ -468,25 +456,25 @@ class JerkProgram:
         self._cones = [(sparse.csr_array((0, k)), np.zeros((0, 4)))]
 
     def add_upper_bounds(self, A: Array, b: Array, first: NDArray[np.intp]) -> None:
-        """Add n rows A c <= b.
+        """Add n linear rows A c <= b for spline coefficients c.
 
         Args:
-            A: (n, width) entries from column `first` on.
+            A: (n, width) successive nonzero entries of each row.
             b: (n,) bounds.
-            first: (n,) first column of each row.
+            first: (n,) index of the coefficient of each row's first entry.
         """
         self._linear.append((self._sparse_rows(A, first), b))
 
     def add_two_sided_bounds(
         self, A: Array, head: Array | float, bound: Array, first: NDArray[np.intp]
     ) -> None:
-        """Add rows -r <= A c <= r with r = bound - head c, m rows at each of n points.
+        """Add linear rows -r <= A c <= r with r = bound - head . c, m rows at each of n points.
 
         Args:
-            A: (n, m, width) entries from column `first` on.
-            head: (n, 1, width) entries of the vector `head` from column `first` on, or 0.
+            A: (n, m, width) successive nonzero entries of each row.
+            head: (n, 1, width) entries of the vector `head` there; 0 for a constant r.
             bound: (n,) bounds.
-            first: (n,) first column of each point's rows.
+            first: (n,) index of the coefficient of the first entry at each point.
         """
         _, m, width = A.shape
         for sign in (1.0, -1.0):
@@ -496,14 +484,14 @@ class JerkProgram:
     def add_norm_bounds(
         self, A: Array, b: Array, head: Array, bound: Array, first: NDArray[np.intp]
     ) -> None:
-        """Add n cones that bound the length of A c + b by bound - head c.
+        """Add n cones that bound the length of A c + b by bound - head . c.
 
         Args:
-            A: (n, 3, width) entries from column `first` on.
+            A: (n, 3, width) successive nonzero entries of each cone's three rows.
             b: (n, 3) constant parts.
-            head: (n, width) entries of the vector `head` from column `first` on.
+            head: (n, width) entries of the vector `head` there.
             bound: (n,) bounds.
-            first: (n,) first column of each cone.
+            first: (n,) index of the coefficient of each cone's first entry.
         """
         rows = np.concatenate([head[:, None], -A], axis=1).reshape(-1, A.shape[2])
         placed = self._sparse_rows(rows, np.repeat(first, 4))
@@ -519,7 +507,7 @@ class JerkProgram:
 
     @cached_property
     def rows(self) -> tuple[sparse.csr_array, Array, sparse.csr_array, Array]:
-        """A and b of all linear rows, then A and b of all cones (four rows each)."""
+        """Matrix A and right side b of all linear rows, then of all cones (four rows each)."""
         from scipy import sparse
 
         A, b = zip(*self._linear, strict=True)
@@ -537,7 +525,8 @@ class JerkProgram:
         return np.asarray(A @ c > share * b), np.asarray(lengths > share * inside[:, 0])
 
     def minimise(self, H: Array, g: Array, about: Array) -> Array | None:
-        """Minimise c^T H c / 2 + g . c over coefficients c (k,).
+        """Minimise c^T H c / 2 + g . c over spline coefficients c (k,), subject to all rows and
+        cones.
 
         The program is solved with few rows, and again with the violated rows added, until no row is
         violated.
@@ -548,7 +537,7 @@ class JerkProgram:
             about: (k,) coefficients near the solution; rows that they nearly use enter at once.
 
         Returns:
-            Coefficients (k,), or None if the solver fails.
+            Coefficients (k,); None if the solver fails.
         """
         rows, cones = self.used(about, NEAR_ACTIVE_SHARE)
         while True:
@@ -564,19 +553,9 @@ class JerkProgram:
     def _solve_subset(
         self, H: Array, g: Array, scale: Array, rows: Mask, cones: Mask
     ) -> Array | None:
-        """Minimise c^T H c / 2 + g . c over coefficients c (k,), subject to a subset of the
-        constraints.
-
-        Args:
-            H: (k, k) matrix of the objective.
-            g: (k,) vector of the objective.
-            scale: (k,) typical sizes of the coefficients; the solver's variables are c / scale.
-            rows: True for each linear row that is applied.
-            cones: True for each cone that is applied.
-
-        Returns:
-            The coefficients; None if the solver fails.
-        """
+        """Minimise c^T H c / 2 + g . c over coefficients c (k,), subject only to the rows and cones
+        that are marked True; None if the solver fails. `scale` (k,) holds typical sizes of the
+        coefficients; the solver's variables are c / scale."""
         # Not imported at the top: only jerk limits need it.
         import clarabel
         from scipy import sparse
@@ -603,16 +582,17 @@ class JerkProgram:
 
 
 def _add_linearised(at: WarpedPath, c: Array, value: Array, by: Array, rows: JerkProgram) -> None:
-    """Add rows value + by (c_new - c) <= 1 for limited values, linearised at coefficients c.
+    """Add rows that bound limited values, linearised at spline coefficients c: value + by . (c_new
+    - c) <= 1.
 
-    A value that exceeds one at c gets a row that allows the same excess.
+    A value above one at c gets a row that allows the same excess.
 
     Args:
         at: samples of the path.
-        c: (k,) coefficients.
+        c: (k,) spline coefficients of the squared speed.
         value: (n, m) values at c over their limits.
         by: (n, m, k) derivatives of the values by the coefficients.
-        rows: program that gets the rows.
+        rows: convex program that gets the rows.
     """
     bound = np.maximum(at.keep[:, None], value) - value + by @ c
     A = at.local(by)

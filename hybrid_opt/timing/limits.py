@@ -39,9 +39,10 @@ class PathLimits:
         self._grasped = limits.robust and not self._squeezed
 
     def joint_accelerations(self) -> tuple[Array, Array]:
-        """Return the derivatives of the joint accelerations, over their limits, by u'' and by u'^2.
+        """Return the derivatives of the joint accelerations, over their limits, by u'' and by u'^2,
+        (n, all joints) each.
 
-        Both are (n, all joints). The limits apply to both signs.
+        The limits apply to both signs.
         """
         first, second = self._derivatives(JOINT_ACCELERATION)
         bound = self._bounds[JOINT_ACCELERATION.name]
@@ -68,11 +69,13 @@ class PathLimits:
         """Compute the normal forces that are convex in (u'', u'^2), over the force limit.
 
         Args:
-            a, w: (n,) values of u'' [1/s^2] and u'^2 [1/s^2].
+            a: (n,) path accelerations u'' [1/s^2].
+            w: (n,) squared path speeds u'^2 [1/s^2].
 
         Returns:
-            Pairs of values (n, 2) and slopes (n, 2, 2) by (u'', u'^2): planned forces, then robust
-            forces if these are limited. Empty without force limit.
+            For planned forces, and for robust forces if these are limited: values (n, 2) of both
+            robots, and their derivatives (n, 2, 2) by (u'', u'^2). An empty list without force
+            limit.
         """
         model, limit = self._model, self._limits.force
         if limit is None:

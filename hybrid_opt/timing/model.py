@@ -217,15 +217,9 @@ class CarryLimits:
         return np.maximum(carry.normal_force, np.stack([leading, commanded], axis=1))
 
     def _near_limit(self, carry: Carry, limits: TimingLimits) -> Array:
-        """Compute `limited_force` (n, 2) [N] of a carry, with robust forces only where they matter.
-
-        Results near the limit or near the largest force are exact. Elsewhere planned forces replace
-        robust ones, which takes a fraction of the time.
-
-        Args:
-            carry: the carry.
-            limits: limits in addition to the workcell's.
-        """
+        """Compute `limited_force` (n, 2) [N] of a carry, exact only near the limit and near the
+        largest force. Elsewhere planned forces replace robust ones, which takes a fraction of the
+        time."""
         if not limits.robust or limits.force is None:
             return self.limited_force(carry, limits)
         if not command_model(self.workcell).has_scalar_squeeze:
@@ -252,14 +246,9 @@ def _bound_of(limit: Limit, workcell: Workcell) -> Array:
 def _robust_forces_above(
     level: float, points: PathPoints, path: RobustPath, found: Array, every: int = 1
 ) -> bool:
-    """Raise entries of `found` to the robust forces at n points, where these exceed a level.
-
-    Args:
-        level: normal force [N] below which robust forces are ignored.
-        points: n points of the path.
-        path: computes robust forces.
-        found: (n, 2) normal forces of both robots [N], changed in place.
-        every: only points with an index divisible by this number are evaluated.
+    """Raise entries of `found` (n, 2) [N], in place, to the robust forces of `path` at n points
+    where these exceed a level [N]. Only every point with an index divisible by `every` is
+    evaluated.
 
     Returns:
         True if any robust force exceeds the level.

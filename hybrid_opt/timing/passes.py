@@ -207,8 +207,9 @@ class RobustCuttingPlanes:
             threads: number of threads that share the paths.
 
         Returns:
-            Outputs of the compiled backward and forward pass by name; and for each path its largest
-            robust forces at rest and their sample if these exceed the force limit, else None.
+            - Outputs of the compiled backward and forward pass, by name.
+            - For each path whose robust forces at rest exceed its force limit: the largest of these
+              forces and their sample. None for other paths.
         """
         still = self._at_rest()
         out = self._passes.batch(self._rows, self._options, self._cuts, threads=threads)
@@ -226,11 +227,11 @@ class RobustCuttingPlanes:
     def _at_rest(self) -> list[AtRest | None]:
         """Find the paths whose robust forces at rest exceed the force limit.
 
-        The other paths get the tangents of robust forces at u' = 0 as supporting lines.
+        The other paths get supporting lines: the tangents of their robust forces at u' = 0.
 
         Returns:
-            For each path its largest robust forces at rest and their sample if these exceed the
-            limit, else None.
+            For each path that exceeds the limit the largest robust forces at rest and their sample;
+            None for other paths.
         """
         n, samples = self._count.shape
         found: list[AtRest | None] = [None] * n

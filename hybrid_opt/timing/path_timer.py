@@ -98,9 +98,9 @@ class PathTimer:
             x: (n, n_path) free waypoints.
 
         Returns:
-            Outputs of `symbolic.limit_coefficients.path_function` by name, and `limits` (n, 2
-            intervals + 1, columns of `symbolic.limits.limit_layout`), at both ends and in the
-            middle of every interval.
+            Outputs of `symbolic.limit_coefficients.path_function` by name. The array `limits` is
+            added: (n, 2 intervals + 1, columns of `symbolic.limits.limit_layout`), coefficients at
+            both ends and in the middle of every interval.
         """
         # One path is not worth a second thread.
         threads = self._threads if len(x) > 1 else 1
@@ -124,12 +124,15 @@ class PathTimer:
         return timing
 
     def path_errors(self, paths: dict[str, Array]) -> list[PathTiming | None]:
-        """Return for each path the error that rules out a timing, None without an error.
+        """Find for each of n paths the error that rules out a timing.
 
         Errors are: no motion, an arm that loses the path, joint limits, and manipulability.
 
         Args:
             paths: result of `path_limits`.
+
+        Returns:
+            For each path a record of the error, with infinite duration; None without an error.
         """
         names = ("lost", "limit_margin", "manipulability")
         sides = [np.stack([paths[f"{name}_{arm}"] for arm in (1, 2)], axis=2) for name in names]

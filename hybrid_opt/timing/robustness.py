@@ -194,8 +194,8 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
 
 
 def _even_margins(model: TimingModel, carry: Carry) -> list[Margin]:
-    """Compute for each elastic pad how far its centre of pressure may shift further until a rim
-    lifts off [m].
+    """Compute for each elastic pad how far its centre of pressure may shift further until the pad's
+    rim lifts off [m].
 
     The shift starts from the largest one of the carry. Contact models without elastic pads give an
     empty list.
@@ -323,15 +323,15 @@ class TimingSensitivity:
             )
 
     def changes(self, low: dict[str, Array], high: dict[str, Array]) -> tuple[float, float]:
-        """Compute how the shortest duration changes with a parameter of the workcell.
+        """Compute how the shortest duration changes with a number of the workcell file.
 
         Args:
-            low, high: result of `CarryLimits.ratios` at `speeds`, for the workcell with the
-                parameter lowered and raised by the same amount.
+            low: result of `CarryLimits.ratios` at `speeds`, with the number lowered.
+            high: the same result with the number raised by the same amount.
 
         Returns:
-            Change of the duration [s] with the parameter raised, and with it lowered; NaN if no
-            timing nearby satisfies the limits.
+            Change of the duration [s] with the number raised, and with it lowered; NaN if no timing
+            nearby satisfies the limits.
         """
         more = (self._select_used(high) - self._select_used(low)) / 2.0
         largest = float(np.abs(more).max(initial=0.0))

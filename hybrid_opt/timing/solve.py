@@ -119,7 +119,8 @@ def _run_programs(
 
 
 def time_by_programs(model: TimingModel, motion: PathMotion, limits: TimingLimits) -> Timing:
-    """Compute the fastest timing of a path by TOPP-RA's linear programs, checked on the finer grid.
+    """Compute the fastest timing of a path by the linear programs of TOPP-RA, checked on the finer
+    grid.
 
     Args:
         model: timing model of the workcell.
