@@ -93,9 +93,8 @@ class Cell:
         self._polishers: dict[PolishSettings, Polisher] = {}
 
     def __reduce__(self) -> tuple[type[Cell], tuple[Any, ...]]:
-        """Return a constructor call that replaces the cell when it is pickled: without functions,
-        which another process loads anew.
-        """
+        """Return what pickle needs to build the cell again in another process: constructor and
+        arguments, without compiled functions, which that process loads anew."""
         return Cell, (self.workcell, self._objectives, self._threads)
 
     @classmethod

@@ -109,9 +109,8 @@ class CompiledCell:
         return build_cell_model(self.workcell, self.bodies, self._searches())
 
     def _searches(self) -> tuple[ArmSearch, ArmSearch] | None:
-        """Return for each arm the search for its start branches, which uses compiled functions. An
-        `InterpretedCell` returns None.
-        """
+        """Return for each arm the search for its start branches, which uses compiled functions;
+        None for an `InterpretedCell`."""
         from symbolic.cell_model import own_clearance
         from symbolic.robot.branches import ArmSearch
 

@@ -160,14 +160,14 @@ class LocalWorkers(Workers):
     def _submit(
         self, function: Callable[[Argument], Result], arguments: Mapping[int, Argument]
     ) -> dict[Future[Result], int]:
-        """Submit calls to the pool of processes, which starts its processes with them.
+        """Submit calls to the pool of processes; the first calls start the processes.
 
         Args:
             function: function of one argument.
-            arguments: argument of each call by the index of the call.
+            arguments: argument of each call, by the index of the call.
 
         Returns:
-            Index of each submitted call, by its future.
+            Index of each submitted call, by the future of its result.
         """
         with _interrupts_later():
             pool, before = self._started(), set(multiprocessing.active_children())

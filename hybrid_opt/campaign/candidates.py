@@ -61,7 +61,7 @@ def _groups(
         reasons: names of the constraints.
 
     Returns:
-        Names of columns by the field of `Evaluations` that they hold.
+        For each field of `Evaluations` the names of the columns that hold it.
     """
     return {
         "x": [f"x_{k + 1}" for k in range(n_var)],
@@ -154,10 +154,10 @@ def _text(line: bytes) -> str:
 
 
 def _rows(file: gzip.GzipFile, width: int, most: int) -> tuple[Array, NDArray[np.int8]]:
-    """Read all rows of candidates.
+    """Read all rows of a file of candidates.
 
-    Rows are read one by one and at most `most` numbers in all, so a small file cannot expand to a
-    huge amount of memory.
+    Rows are read one by one and at most `most` numbers in all, so a small compressed file cannot
+    expand to a huge amount of memory.
 
     Args:
         file: the file, after its header.
@@ -165,8 +165,8 @@ def _rows(file: gzip.GzipFile, width: int, most: int) -> tuple[Array, NDArray[np
         most: largest number of numbers in the file.
 
     Returns:
-        Numbers (n, width - 1) of the n candidates, and index (n,) of the constraint that each
-        violates first.
+        - Numbers (n, width - 1) of the n candidates.
+        - Index (n,) of the constraint that each candidate violates first.
     """
     reasons = {"": FEASIBLE, **{reason: k for k, reason in enumerate(REASONS)}}
     numbers, found = array("d"), array("b")

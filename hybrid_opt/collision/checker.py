@@ -374,8 +374,12 @@ class CollisionChecker:
         return found
 
     def _find_resting(self) -> list[tuple[int, Array, float]]:
-        """Find the places at which the payload may rest on a body: index of the pair, box centre
-        (3,) [m] and departure [m] of each, as in `resting_places`.
+        """Find the places at which the payload may rest on a body.
+
+        Returns:
+            For each place, as in `resting_places`: index of the pair of payload and body, box
+            centre (3,) [m] in the world, and departure [m] (distance from this centre within which
+            the payload may touch the body).
         """
         task = self.geometry.workcell.task
         pairs = {names: k for k, names in enumerate(self._names)}

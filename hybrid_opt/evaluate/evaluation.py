@@ -243,17 +243,17 @@ class CandidateEvaluator:
         return other
 
     def outputs(self, x: Array) -> dict[str, Array]:
-        """Compute all outputs of `symbolic.functions.candidate_function`, such as poses, joints and
-        forces, at the samples of candidates.
+        """Compute poses, joint positions, forces and all other outputs of
+        `symbolic.functions.candidate_function` at the samples of candidates.
 
-        In drivable cells the result also has the outputs of
-        `hybrid_opt.timing.path_timer.CandidateDriver.outputs`.
+        In drivable cells the outputs of `hybrid_opt.timing.path_timer.CandidateDriver.outputs` are
+        added.
 
         Args:
             x: (n, n_var) decision vectors.
 
         Returns:
-            Arrays (n, samples, ...) by name.
+            Arrays (n, samples, ...) by name of the output.
         """
         return self._outputs(self._checked(x))
 
@@ -532,8 +532,13 @@ class LockedEvaluator:
         return replace(self._evaluator.evaluate(self._whole(x)), x=x)
 
     def certified(self, evaluations: Evaluations) -> Evaluations:
-        """Return the evaluations after a check for collisions between the samples. Afterwards every
-        member of the feasible front is proven free of collisions.
+        """Certify the members of the feasible front between their samples, and return corrected
+        evaluations.
+
+        Every member of the corrected front is proven free of collisions.
+
+        Args:
+            evaluations: evaluations by this evaluator.
         """
         whole = replace(evaluations, x=self._whole(evaluations.x))
         return replace(self._evaluator.certified(whole), x=evaluations.x)

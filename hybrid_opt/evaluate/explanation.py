@@ -83,10 +83,14 @@ def explain(evaluator: CandidateEvaluator, evaluations: Evaluations) -> tuple[Ex
 
 
 def frequent(explanations: Iterable[Explanation]) -> dict[str, dict[str, int]]:
-    """Count failures by colliding pair, joint beyond its limit, and arm out of reach.
+    """Count failures of candidates by their causes.
+
+    Args:
+        explanations: reasons why candidates fail.
 
     Returns:
-        Under 'pairs', 'joints' and 'reach' the number of failures by name, the largest first.
+        Three tables with the number of failures by name, the largest first: 'pairs' by colliding
+        pair of bodies, 'joints' by joint beyond its limit, 'reach' by robot that does not reach.
     """
     counts: dict[str, Counter[str]] = {"pairs": Counter(), "joints": Counter(), "reach": Counter()}
     for one in explanations:
@@ -139,7 +143,8 @@ def missing_reach(robot: Robot, contact: Contact, T_world_box: Array, q: Array) 
     the flange may come nearer.
 
     Args:
-        robot, contact: the arm and its contact.
+        robot: the arm.
+        contact: contact of this arm on the box.
         T_world_box: (4, 4) pose of the box.
         q: (n,) initial posture [rad].
     """

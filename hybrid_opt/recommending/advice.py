@@ -279,8 +279,8 @@ def _larger(cup: Contact) -> Contact:
 
 
 def _strength(workcell: Workcell, other: Workcell) -> float:
-    """Return the ratio of the weakest holding force of two cells; 1 for pads, which have no holding
-    force.
+    """Return the weakest holding force of one cell over that of another cell; 1 for pads, which
+    have no holding force.
 
     Args:
         workcell: the cell whose holding force is the denominator.
@@ -291,9 +291,10 @@ def _strength(workcell: Workcell, other: Workcell) -> float:
 
 
 def _of_pitch(cell: Cell, path: Array, option: Option, slope: float) -> Iterator[Advice]:
-    """Yield the effect of one degree more, or less, pitch at each via-point, if it shortens the
-    carry at the same commanded force. Via-points at which the changed path has no timing are left
-    out.
+    """Yield the effect of one degree more, or less, pitch of the box at each via-point.
+
+    A change is yielded only if it shortens the carry at the same commanded force. Via-points at
+    which the changed path has no timing are left out.
 
     Args:
         cell: the drivable cell.

@@ -65,7 +65,7 @@ class Wish:
     uncertainty: Uncertainty | None = None
 
     def __post_init__(self) -> None:
-        """Check the values.
+        """Check that at most one of duration and force is given, and that all numbers are positive.
 
         Raises:
             SettingsError: both a duration and a force are given, or a number is not positive.
@@ -252,7 +252,7 @@ class DrivenPaths:
         """Compute the fastest timing of paths within force limits.
 
         Args:
-            force: force limit, one per timed path or one for all [N].
+            force: force limit [N]: one for each timed path, or one for all of them.
             rows: indices of the paths to time; None for all.
 
         Returns:
@@ -318,11 +318,11 @@ class DrivenPaths:
         """Compute timings of every path: one within the path's own force limit, and one within each
         of `FORCES` further limits.
 
-        The further limits lie between a little more than the force at rest and `highest_force`.
-        They are left out if force limits bound robust forces.
+        The further limits lie between a little more than the force at rest and `highest_force`. If
+        force limits bound robust forces, only the timings within the own limits are computed.
 
         Args:
-            own: own force limit, one per path (k,) or one for all [N].
+            own: own force limit [N]: one per path (k,), or one for all paths.
             told: function without arguments that advances a progress display; it is called `FORCES`
                 times.
         """

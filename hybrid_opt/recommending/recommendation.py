@@ -359,8 +359,13 @@ def required_forces(workcell: Workcell, carry: Carry) -> Array:
 
 
 def _objections(found: CommandedForces) -> list[str]:
-    """Return sentences that object to running a carry; empty for none. Objections are: no job is
-    possible, no uncertainty is stated, or a stop of one arm would pull the pads too far apart.
+    """Return sentences that object to running a carry; an empty list for none.
+
+    There are three objections:
+
+    - no job is possible;
+    - no uncertainty is stated;
+    - a stop of one arm would pull the pads too far apart.
 
     Args:
         found: commanded forces of the carry, with its job.

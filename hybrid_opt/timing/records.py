@@ -103,7 +103,7 @@ class JerkLimits:
     payload: float = float("inf")
 
     def __post_init__(self) -> None:
-        """Check the limits.
+        """Check that all limits are positive.
 
         Raises:
             SettingsError: a limit is not positive.

@@ -112,7 +112,7 @@ class _CuttingPlaneProblem:
         self._duration = np.inf
 
     def _first_rows(self) -> Iterator[LinearLimits]:
-        """Yield the linear limits of the first program.
+        """Yield the linear limits of the first linear program of TOPP-RA.
 
         These are the limits on speeds and joint accelerations, and the first supporting lines
         (tangents) of the convex limits.
@@ -295,11 +295,12 @@ class _CuttingPlaneProblem:
 
 
 def norm_rows(first: Array, second: Array, limit: float, directions: Array) -> LinearLimits:
-    """Return supporting lines (tangents) of the limit on the length of the vector first u'' +
-    second u'^2.
+    """Return supporting lines (tangents) of a limit on the length of the vector first u'' + second
+    u'^2.
 
     Args:
-        first, second: (n, 3) coefficient vectors at n points.
+        first: (n, 3) derivative of the vector by u'' at n points.
+        second: (n, 3) derivative of the vector by u'^2.
         limit: largest allowed length.
         directions: (n, k, 3) unit vectors; each gives one line.
     """
@@ -321,16 +322,17 @@ def tangent_rows(value: Array, gradient: Array, z: Array) -> LinearLimits:
 
 
 def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> LinearLimits:
-    """Linearise k functions of (u'', u'^2) that may not exceed one, such that rest stays feasible.
+    """Linearise about z k functions of (u'', u'^2) that may not exceed one, such that rest stays
+    feasible.
 
-    They are linearised about z. A tangent that forbids rest is changed: it keeps its slope by u'',
-    but its slope by u'^2 becomes that of the line from z to rest. If its bound were raised instead,
-    it would not even exclude z.
+    A tangent that forbids rest (u'' = u'^2 = 0) is changed: its slope by u'^2 becomes that of the
+    line from z to rest, and its slope by u'' stays. A larger bound instead would not even exclude
+    z.
 
     Args:
         value: (n, k) values of the functions at z.
         gradient: (n, k, 2) their gradients at z by (u'', u'^2).
-        at_rest: (n, k) their values at u'' = u'^2 = 0, below one.
+        at_rest: (n, k) their values at rest, below one.
         z: (n, 2) values of (u'', u'^2) at n points.
     """
     lines = tangent_rows(value, gradient, z)

@@ -216,18 +216,20 @@ alone reaches 1.04."""
 def delay(
     time: Array, first: Array, second: Array, most: float = 1.0, apart: float | None = None
 ) -> float | None:
-    """Estimate by how much a signal lags behind another [s]; negative if it is ahead.
+    """Estimate by how much the second signal lags behind the first [s]; negative if it is ahead.
 
     Args:
         time: (n,) times of the samples [s].
-        first, second: (n,) the leading and the lagging signal, in any unit.
+        first: (n,) the leading signal, in any unit.
+        second: (n,) the lagging signal, in any unit.
         most: largest delay in either direction that is considered [s].
-        apart: delays up to this magnitude are compared with the result [s]; None to skip this test.
+        apart: largest magnitude of other delays that are compared with the result [s]; None to skip
+            this comparison.
 
     Returns:
-        The delay with the largest correlation of both signals' rates; None if the signals are too
-        short, if that correlation is weak, or if the correlation for a delay up to `apart` is
-        nearly as large.
+        The delay with the largest correlation of both signals' derivatives by time. None if the
+        signals are too short, if this correlation is weak, or if another delay up to `apart` has
+        nearly the same correlation.
     """
     wide = round(SMOOTHED / GRID_STEP)
     if not 4 * wide < (time[-1] - time[0]) / GRID_STEP < LARGEST_GRID:

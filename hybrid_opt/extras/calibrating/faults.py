@@ -99,14 +99,17 @@ def recording_faults(workcell: Workcell, run: Recording, places: Places) -> list
 
 
 def _tare_faults(run: Recording, places: Places) -> list[Fault]:
-    """Return faults of the labelled tares of a run, instants at which the arms touch nothing and
-    the sensors' offsets are measured.
+    """Check the labelled tares of a run: instants at which the arms touch nothing and the sensors'
+    offsets are measured.
 
     A tare has a fault if nothing was recorded, or if an arm touches something.
 
     Args:
         run: the run.
         places: pad poses and wrenches of the run.
+
+    Returns:
+        The faults; an empty list for none.
     """
     found = []
     recorded = [instant for instant in run.labels.tare if run.around(instant).any()]

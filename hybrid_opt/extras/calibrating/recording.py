@@ -150,7 +150,10 @@ class ArmLog:
 
 
 def lost_spans(time: Array, values: Array) -> Spans:
-    """Find intervals without new samples: longer than usual without any, or with repeated values.
+    """Find intervals of a recording without new samples.
+
+    In such an interval the time between two samples is longer than usual, or all samples repeat the
+    same values.
 
     Args:
         time: (m,) ascending times [s].
