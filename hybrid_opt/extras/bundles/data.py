@@ -172,11 +172,11 @@ def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, s
     poses = np.concatenate([T[..., :3, 3], turns.reshape(*T.shape[:2], 4)], axis=2).tolist()
 
     def placed(kind: str, pose: list[float]) -> tuple[Any, Any]:
-        """Convert a pose to ROS messages of a position and a quaternion.
+        """Convert a pose to two ROS messages: the position, and the quaternion.
 
         Args:
             kind: type of the position's message in `geometry_msgs`.
-            pose: position [m] and quaternion x, y, z, w.
+            pose: position [m], then the quaternion x, y, z, w.
         """
         turn = of("geometry_msgs/Quaternion", *pose[3:])
         return of(f"geometry_msgs/{kind}", *pose[:3]), turn

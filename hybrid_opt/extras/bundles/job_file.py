@@ -142,14 +142,19 @@ def gap_of(sampled: SampledJob, interpolation: Interpolation, stiffness: float) 
 
 
 def between(time: Array, known: Sequence[Array], interpolation: Interpolation) -> BPoly:
-    """Interpolate joint positions between samples as a controller does: in each step by the
-    polynomial of least degree that has the given positions and derivatives at both ends.
+    """Interpolate joint positions between samples as a controller does.
+
+    In each time step this is the polynomial of least degree that has the given positions and
+    derivatives at both ends.
 
     Args:
         time: (n,) ascending times [s].
-        known: arrays (n, joints) of positions, then velocities, then accelerations; those that the
-            interpolation does not use are ignored [rad or m, and s].
+        known: arrays (n, joints) of positions [rad or m], then velocities, then accelerations [per
+            s, per s^2]. Arrays that the interpolation does not use are ignored.
         interpolation: kind of interpolation.
+
+    Returns:
+        The piecewise polynomial of time, with values (joints,).
     """
     taken = np.stack(known[: DERIVATIVES[interpolation]], axis=1)
     return BPoly.from_derivatives(time, taken)

@@ -374,5 +374,5 @@ def missing_text(name: str, workcell: Workcell) -> str:
 
 
 def targets() -> dict[str, str]:
-    """Return a text on how to run a bundle, for each target of `export` by name."""
+    """Return for each target of `export`, by name, a text on how its bundle is run."""
     return {name: target.how_to_run for name, target in TARGETS.items()}

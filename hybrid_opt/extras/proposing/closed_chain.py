@@ -75,12 +75,12 @@ class _Follower:
         self.lower, self.upper = many.lower + LIMIT_MARGIN, many.upper - LIMIT_MARGIN
 
     def close(self, T_world_box: Array, extended: Array, q: Array) -> Array | str:
-        """Find the joint positions near q with which the arm holds the box.
+        """Find the joint positions near `q` with which the arm holds the box.
 
         Args:
             T_world_box: (4, 4) pose of the box.
-            extended: (6 + m,) box pose followed by m redundant joints, of which only the joints are
-                used [rad or m].
+            extended: (6 + m,) vector of which only the m last entries, the redundant joints [rad or
+                m], are used; the box pose comes from `T_world_box`.
             q: (joints,) joint positions at a configuration nearby [rad or m].
 
         Returns:

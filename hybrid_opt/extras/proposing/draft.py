@@ -127,14 +127,14 @@ def changes(problem: Problem, found: Draft) -> dict[str, Any]:
 
 
 def decision_bounds(workcell: Workcell) -> tuple[Array, Array]:
-    """Compute the widths and the limits with which bounds of the decision vector are searched.
+    """Compute how wide and how far the bounds of the decision vector may be.
 
     Args:
         workcell: the cell, with the hand-made trajectory.
 
     Returns:
-        Half-widths (n_var,) of bounds, to be multiplied by one common factor [m, rad]; and limits
-        (2, n_var), the smallest lower and the largest upper bounds.
+        - Half-widths (n_var,) of bounds [m, rad], which a search multiplies by one common factor.
+        - Limits (2, n_var) of bounds [m, rad]: the smallest lower and the largest upper bounds.
     """
     task, n = workcell.task, len(workcell.task.waypoints)
     poses = [pose_limits(pose, task.orientation) for pose in task.initial]

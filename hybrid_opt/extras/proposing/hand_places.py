@@ -47,13 +47,13 @@ Entry = dict[str, Any]
 
 
 def pattern_entry(entry: Entry, thickness: float) -> Entry:
-    """Return a contact's file entry with its hands placed relative to the first hand.
+    """Return a contact's table, as in a file, with its hands placed relative to the first hand.
 
     The first hand is at the origin with its z axis into the payload.
 
     Args:
-        entry: entry of the contact in the problem file, without `xyz`; `xyz` of the hands in
-            `further` is already relative to the first hand.
+        entry: table of the contact in the problem file, without `xyz`. The `xyz` of the hands in
+            `further` are already relative to the first hand.
         thickness: thickness of the payload [m]. It places the opposite finger of a gripper that has
             no `further`.
     """
@@ -67,12 +67,12 @@ def pattern_entry(entry: Entry, thickness: float) -> Entry:
 
 
 def place_entry(contact: Contact, with_normals: bool = False) -> Entry:
-    """Return the keys of a contact's file entry that place its hands or pads on the box: `xyz`,
-    `spin`, `further`, and `normal` if wanted.
+    """Return the keys of a contact's table in a file that place its hands or pads on the box:
+    `xyz`, `spin` and `further`.
 
     Args:
         contact: the contact.
-        with_normals: True to include `normal`.
+        with_normals: True to include the key `normal`.
     """
     entries: list[Entry] = []
     for pad in (contact, *contact.further):
@@ -93,8 +93,8 @@ def hand_places(
 ) -> list[list[Entry]]:
     """Propose places of both arms' hands on a box.
 
-    Places come first if the box at rest needs a small share of the hands' holding force. Places at
-    which the arms would cross are left out.
+    Places at which the box at rest needs a small share of the hands' holding force come first.
+    Places at which the arms would cross are left out.
 
     Args:
         patterns: contact of each arm, with its hands placed relative to the first one as by
@@ -102,10 +102,10 @@ def hand_places(
         size: (3,) edges of the box [m].
         rotations: (n, 3, 3) R_world_box at the ends of the carry.
         along: (3,) vector from robot 2 to robot 1 in the box frame; zeros if unknown.
-        workcell: function that reads the cell with given file entries of both contacts.
+        workcell: function that reads the cell with given tables of both contacts.
 
     Returns:
-        File entries of both contacts, for each proposal.
+        For each proposal the tables of both contacts, as in a file.
     """
     pairs = [
         (first, second)

@@ -275,7 +275,7 @@ class _Finder:
             T_box_joint: pose (4, 4) of the arm's last joint in the box frame, for each rotation.
 
         Returns:
-            Postures (n, joints) [rad or m], and the index (n,) of each posture's rotation in
+            Postures (n, joints) [rad or m]; and for each posture the index (n,) of its rotation in
             `T_box_joint`.
         """
         kinematics, found, start = self.kinematics, self.found, self.query.start

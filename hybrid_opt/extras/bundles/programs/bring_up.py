@@ -341,15 +341,15 @@ def bring_up(
 
 def require(folder: Path, job: Job, plan: dict[str, Any]) -> list[Measured]:
     """Read the measured properties of both arms from a bundle's folder and compare them with the
-    plan.
+    planned values.
 
     Args:
         folder: folder of the bundle.
         job: the job.
-        plan: planned values, as in the configuration of the bundle.
+        plan: planned values, as `plan` in the bundle's configuration.
 
     Returns:
-        The measured properties of each arm.
+        The measured properties of the first and of the second arm.
 
     Raises:
         Refused: nothing was measured, or a value differs too much from the plan.

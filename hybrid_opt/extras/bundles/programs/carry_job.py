@@ -178,11 +178,11 @@ class Job:
         return math.dist(last, list(here)[:3]) <= TOUCH
 
     def stand(self, s: float, q: Sequence[Sequence[float] | None]) -> None:
-        """Let the release begin at a place within the set-down, because the box stands already. All
-        later references are shifted accordingly.
+        """Let the release begin at a place within the set-down, because the box stands already.
 
-        While the commanded forces decrease, the references of the arms move to the measured
-        positions. So arms that give way under force release the box as well.
+        All later planned positions are shifted accordingly. While the commanded forces decrease,
+        the commanded positions of the arms move to the measured ones. So arms that give way under
+        force release the box as well.
 
         Args:
             s: planned time, within the set-down, at which the box stands [s].

@@ -273,8 +273,9 @@ class Stream:
             print(self.status(), file=sys.stderr)
 
     def answer(self, arm: int, number: int, now: float) -> bytes:
-        """Encode the message that commands an arm's position, taken from the path ahead by the
-        arm's delay.
+        """Encode the message that commands an arm's joint positions.
+
+        The positions are those that the path reaches one delay of the arm later.
 
         Args:
             arm: index of the arm.
@@ -425,7 +426,8 @@ def streamed(
 
 
 def received(source: socket.socket) -> Iterator[tuple[bytes, Any]]:
-    """Yield the content and the sender's address of each packet that waits in a socket.
+    """Yield each packet that waits in a socket: its content, and the sender's address as Python's
+    `socket` gives it.
 
     Args:
         source: the socket.

@@ -89,11 +89,12 @@ def type_of(kind: str) -> Any:
 
 
 def fill(message: Any, values: dict[str, Any]) -> None:
-    """Set the fields of a message from a dictionary.
+    """Set the fields of a ROS message from a dictionary.
 
     Args:
-        message: the message, which is changed.
-        values: values by name of the field; a dictionary for a field that is a message.
+        message: the message, which is changed in place.
+        values: value of each field by its name. For a field that is itself a message, the value is
+            such a dictionary.
 
     Raises:
         AttributeError: the message has no such field.
@@ -484,12 +485,14 @@ class Run:
             self.node.get_logger().error(f"{error}; its arm goes on as it was last told")
 
     def drive(self, part: Job, word: str) -> bool:
-        """Run a part of the job to its end and back, after somebody has typed a word. Return True
-        if this run was completed.
+        """Run a part of the job to its end and back, after somebody has typed a word.
 
         Args:
             part: the part of the job.
-            word: the word.
+            word: word that has to be typed at the terminal.
+
+        Returns:
+            True if this run was completed.
         """
         self.take(part)
         self.node.get_logger().info(BLOCK if word else AIR)
