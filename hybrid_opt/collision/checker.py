@@ -203,10 +203,9 @@ class CollisionChecker:
                 [rad].
 
         Returns:
-            - Chord (n, n_pairs) [m]: a bound of the distance that the bodies move relative to each
-              other from start to end.
-            - Bend (n, n_pairs) [m]: a bound of the second derivative of this motion by the share of
-              the way (`symbolic.geometry.clearance`).
+            Chord and bend (n, n_pairs) [m]. The chord bounds the distance that the bodies move
+            relative to each other from start to end. The bend bounds the second derivative of this
+            motion by the share of the way (`symbolic.geometry.clearance`).
         """
         asked = [self.functions[f"{block}motion"] for block in self.geometry.asked]
         found = [function.batch(*start, *end) for function in asked]

@@ -200,26 +200,28 @@ class _Chains:
         self._write()
 
     def left(self, column: float) -> list[tuple[float, ...]]:
-        """Return the unfinished combinations whose last key has a given value, as tuples of all
-        keys' values.
+        """Return the unfinished combinations whose last key has a given value.
 
         Args:
             column: value of the last key.
+
+        Returns:
+            The values of all keys, for each combination.
         """
         every = [(*head, column) for head in self._heads]
         return [values for values in every if values not in self.done]
 
     def near(self, values: tuple[float, ...]) -> Array | None:
-        """Return the carry found for a neighbour of a combination; None if there is none.
+        """Return the carry found for a combination that differs from a given one in the last key
+        only.
 
-        The neighbour differs in the last key only. It is the nearest finished one before the
-        combination.
+        Of the finished combinations with an earlier value of this key, the nearest one is taken.
 
         Args:
-            values: values of the combination.
+            values: values of the given combination, in the order of the keys.
 
         Returns:
-            (n_var,) decision vector of the neighbour's carry.
+            (n_var,) decision vector of the carry; None if there is none.
         """
         *head, last = values
         for value in reversed(self.columns[: self.columns.index(last)]):

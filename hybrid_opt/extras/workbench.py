@@ -196,12 +196,15 @@ class Session:
         return unpack_cell(collect_cell(cell.workcell), folder).source
 
     def export(self, target: str, folder: str | Path) -> tuple[Path, ...]:
-        """Write the job around the carry as a bundle for robots, and the carry as carry.json.
-        Return the paths of all written files.
+        """Write the job around the present carry as a bundle for robots, and the carry as
+        carry.json.
 
         Args:
-            target: name of the export's target.
+            target: name of the bundle's target.
             folder: folder of the bundle.
+
+        Returns:
+            Paths of all written files.
 
         Raises:
             DualArmError: the carry is not feasible, or the target does not support it.

@@ -582,10 +582,9 @@ class JerkProgram:
 
 
 def _add_linearised(at: WarpedPath, c: Array, value: Array, by: Array, rows: JerkProgram) -> None:
-    """Add rows that bound limited values, linearised at spline coefficients c: value + by . (c_new
-    - c) <= 1.
+    """Add rows value + by (c_new - c) <= 1 for limited values, linearised at spline coefficients c.
 
-    A value above one at c gets a row that allows the same excess.
+    A value that exceeds one at c gets a row that allows the same excess.
 
     Args:
         at: samples of the path.

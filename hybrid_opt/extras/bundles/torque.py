@@ -232,10 +232,10 @@ def _grip(export: Export, arm: int) -> dict[str, Any]:
         arm: index of the arm.
 
     Returns:
-        - `name` and `kind`: name and type of the service that switches the hands.
-        - `on` and `off`: fields of the service's request that close and open them.
-        - `input`: `topic`, `kind` (message type) and `pin` with which the hands report that they
-          hold; None if they report nothing.
+        A dictionary. `name` and `kind` are name and type of the service that switches the hands.
+        `on` and `off` are the fields of the two requests. `input` has the `topic`, its message type
+        `kind` and the `pin` with which the hands report that they hold; it is None if they report
+        nothing.
     """
     driver = export.workcell.robots[arm].driver
     io = f"/{_values(export, arm)['space']}/io_and_status_controller"

@@ -157,13 +157,14 @@ def fit_load(holds: Sequence[MeasuredHold], moments: bool = True) -> Load:
 def _balance(hold: MeasuredHold) -> tuple[Array, Array, Array]:
     """Build the linear system of the balance of forces and moments on a box that is held still.
 
+    Its rows are three equations of forces [N], then three of moments [N m]. The unknowns are mass,
+    centre of mass and crosstalk, as in `Load`.
+
     Args:
         hold: the measurement.
 
     Returns:
-        - Matrix (6, unknowns) and right side (6,): three equations of forces [N], then three of
-          moments [N m]. The unknowns are mass, centre of mass and crosstalk, as in `Load`.
-        - Covariance (6, 6) of the right side.
+        Matrix (6, unknowns), right side (6,), and covariance (6, 6) of the right side.
     """
     matrix, value, noise = np.zeros((6, len(WIDTHS))), np.zeros(6), np.zeros((6, 6))
     matrix[:3, 0] = hold.gravity

@@ -387,8 +387,8 @@ def _error(target: Array, T: Array) -> tuple[Array, Array]:
         T: (n, 4, 4) actual poses, in the same frame as `target`.
 
     Returns:
-        - Differences (n, 6): target position minus actual position [m], then the axis of the
-          rotation from the actual to the wanted orientation, times the sine of its angle. Axes are
+        - Differences (n, 6), target position minus actual position [m], then the axis of the
+          rotation from the actual to the wanted orientation times the sine of its angle. Axes are
           those of the common frame.
         - Norm (n,) of position difference and rotation together.
     """

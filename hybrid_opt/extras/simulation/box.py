@@ -111,13 +111,17 @@ class Threshold(Generic[AnyOutcome]):
 def bisected(
     simulate: Callable[[float], AnyOutcome], low: float, high: float, steps: int
 ) -> Threshold[AnyOutcome]:
-    """Find the least factor with which the box holds in a simulation, by bisection between two
-    factors.
+    """Find by bisection the least factor with which the box holds in a simulation.
 
     Args:
         simulate: function that runs a simulation with a factor and returns its outcome.
-        low, high: a factor at which the box slips, and one at which it holds.
+        low: factor at which the box slips.
+        high: factor at which the box holds.
         steps: number of bisections.
+
+    Returns:
+        The outcome with the largest factor found at which the box slips, and the one with the least
+        factor found at which it holds.
 
     Raises:
         SimulationError: the box holds at `low` or slips at `high`.
@@ -175,8 +179,9 @@ class HeldBox:
         """Measure how far the box has moved between its pads since the first call.
 
         Returns:
-            Slip (2,), the largest displacement of the box in the plane of each pad, at the rim of
-            its patch [m]; and rotation of the box relative to the pads [rad].
+            - Slip (2,), for each pad the largest displacement of the box in the pad's plane, at the
+              rim of its patch [m].
+            - Rotation of the box relative to the first pad [rad].
         """
         axes = self._data.site_xmat[self.sites].reshape(2, 3, 3)
         places = self._data.site_xpos[self.sites][:, None]
@@ -256,15 +261,15 @@ class Drive:
 
 
 def planned_moments(cell: Cell, carry: Carry) -> Array:
-    """Compute the moment of each robot's planned wrench about the middle of its pads, world frame:
-    at rest before the carry, then at its n samples.
+    """Compute the moment of each robot's planned wrench about the middle of the robot's pads.
 
     Args:
         cell: the cell.
         carry: the carry at n samples.
 
     Returns:
-        (n + 1, 2, 3) moments [N m].
+        (n + 1, 2, 3) moments of both robots, world frame [N m]: first at rest before the carry,
+        then at its samples.
     """
     workcell = carry.workcell
     still = np.zeros_like(carry.rate[:1])

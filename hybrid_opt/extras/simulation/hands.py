@@ -216,15 +216,15 @@ class HandSimulation:
 
 
 def own_forces(workcell: Workcell, forces: Array) -> Array:
-    """Convert holding forces that would apply if both robots had the weaker hands to the holding
-    forces of each robot's own hands.
+    """Compute the holding force of each robot's hands from the forces that would hold the payload
+    if both robots had the weaker hands.
 
     Args:
         workcell: the cell.
         forces: (2,) holding forces as if both robots had the weaker hands [N].
 
     Returns:
-        (2,) holding force of each robot's hands [N].
+        (2,) holding force of each robot's own hands [N].
     """
     own = np.array([contact.holding_force for contact in workcell.contacts])
     return np.asarray(forces * own / own.min())
@@ -279,10 +279,12 @@ class HeldInHands:
         """Measure how far the payload has moved in the hands.
 
         Returns:
-            Slip (2,), the largest displacement of the payload along the patches of each robot's
-            hands since the first call [m]. Lift (2,), the largest height of the payload above a rim
-            of each robot's hands [m], negative while all rims are pressed. Rotation of the payload
-            relative to the carriage, the body that bears all hands, since the first call [rad].
+            - Slip (2,), for each robot the largest displacement of the payload along the patches of
+              its hands since the first call [m].
+            - Lift (2,), for each robot the largest height of the payload above a rim of its hands,
+              negative while all rims are pressed [m].
+            - Rotation of the payload since the first call [rad], relative to the carriage, the body
+              that bears all hands.
         """
         data = self._data
         axes = data.xmat[self._bodies].reshape(-1, 3, 3)

@@ -235,12 +235,15 @@ def carriage_text(
 
 
 def compiled(mujoco: ModuleType, text: str, damping: float = LAYER_DAMPING) -> tuple[Any, str]:
-    """Compile an MJCF document. Return MuJoCo's model, and the document as MuJoCo reads it.
+    """Compile an MJCF document.
 
     Args:
-        mujoco: the simulator's module.
+        mujoco: the simulator's Python module.
         text: the document.
         damping: damping ratio of the elastic layers at the pads' contact points.
+
+    Returns:
+        MuJoCo's model, and the document as MuJoCo reads it.
     """
     scene = mujoco.MjSpec.from_string(text)
     model = scene.compile()
