@@ -529,11 +529,12 @@ def _mount(robot: Robot, still: Collection[str]) -> str:
 
 
 def body_names(workcell: Workcell) -> dict[str, tuple[str, ...]]:
-    """Return the names of all bodies for the keys that name collision pairs, by owner.
+    """Return the names of all bodies, by which a workcell file excludes pairs from checks.
 
-    The owners are `payload`, `environment` and both robots. The payload is called `payload`; a body
-    of the environment has its own name; a link or tool body of a robot is `ROBOT/NAME`. Fixed links
-    of a machine with both arms have the name of the first robot.
+    The keys of the result are the bodies' owners: `payload`, `environment` and the names of both
+    robots. The payload is called `payload`; a body of the environment has its own name; a link or
+    tool body of a robot is `ROBOT/NAME`. Fixed links of a machine with both arms have the name of
+    the first robot.
     """
     names = {
         PAYLOAD_NAME: (PAYLOAD_NAME,),
