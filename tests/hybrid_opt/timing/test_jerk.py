@@ -115,11 +115,11 @@ def test_a_straight_way_takes_the_time_of_the_s_curve(
 @pytest.mark.parametrize(
     ("seed", "share", "joints", "payload"),
     [
-        (0, None, 30.0, 20.0),
         (1, 1.1, 50.0, 30.0),
         *(
             pytest.param(*case, marks=pytest.mark.slow)
             for case in (
+                (0, None, 30.0, 20.0),
                 (2, None, 20.0, 100.0),
                 (3, 1.05, 80.0, 80.0),
                 (4, None, 200.0, 10.0),

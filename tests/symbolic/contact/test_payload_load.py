@@ -287,7 +287,11 @@ def even(cell: Workcell) -> Workcell:
 
 @pytest.mark.parametrize(
     ("kinds", "count"),
-    [(None, 20), (("round", "rectangle"), 2), (("rectangle", "round", "rectangle"), 2)],
+    [
+        (None, 20),
+        pytest.param(("round", "rectangle"), 2, marks=pytest.mark.slow),
+        (("rectangle", "round", "rectangle"), 2),
+    ],
 )
 def test_pads_that_press_evenly_balance_the_motion(
     kinds: tuple[str, ...] | None, count: int
