@@ -236,17 +236,19 @@ class _Sweep:
         return hopeless
 
     def _measure(self, work: Intervals, end: End, last: bool) -> NDArray[np.intp]:
-        """Measure distances at one end of m intervals where halving would take too long.
+        """Measure distances of bodies at the first or the last configuration of m intervals.
 
-        The measured distances replace the bounds in `end`.
+        A pair is measured if it is not proven to be free in the interval, and its distance bound is
+        so small that further halving would take longer than the measurement. The measured distances
+        replace the bounds in `end`.
 
         Args:
             work: the intervals.
-            end: one end of the intervals.
-            last: True to measure all pairs without a proof.
+            end: configurations and distance bounds at this end of each interval.
+            last: True to measure every pair that is not proven to be free, whatever its bound.
 
         Returns:
-            (m,) index of the first colliding pair at each end, or -1.
+            (m,) index of the first pair that collides at this end of each interval; -1 for none.
         """
         beyond = end.clearance - self._required(work)
         hopeless = ~(beyond > HALVING_WINS * work.chord)

@@ -176,10 +176,13 @@ def balanced_scalarisation(anchor: Array, span: Array) -> Scalarisation:
 def scalarisation_for(anchor: Array, span: Array, objective: int | None) -> Scalarisation:
     """Return the scalarisation that aims at an end of the front or at its balanced middle.
 
+    Both scale a peak force f, given over the reference force, to (f - anchor) / span.
+
     Args:
-        anchor: (2,) peak forces over the reference forces, the origin of the scaled ones.
-        span: (2,) scale of each peak force.
-        objective: index of the peak force that is least at the end; None for the balanced middle.
+        anchor: (2,) origin of the scale of each peak force.
+        span: (2,) unit of the scale of each peak force.
+        objective: 0 or 1 for the end with the least peak force of this robot; None for the balanced
+            middle.
     """
     return (
         balanced_scalarisation(anchor, span)

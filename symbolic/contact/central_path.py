@@ -429,16 +429,22 @@ def symmetric(rows: Sequence[Sequence[ca.SX]]) -> ca.SX:
 
 
 class Factors:
-    """Factorisation L D L' of a symmetric matrix (n, n), of its first k unknowns or of all.
+    """Factorisation L D L' of a symmetric matrix (n, n), complete or stopped after k columns.
     Structural zeros are skipped.
 
+    Stopped after k columns, it eliminates the first k unknowns of a linear system with this matrix.
+
     Attributes:
-        schur_complement: (n - k, n - k) matrix of the other unknowns after the elimination.
+        schur_complement: (n - k, n - k) matrix that remains for the other n - k unknowns.
     """
 
     def __init__(self, matrix: ca.SX, k: int | None = None) -> None:
-        """Compute the factors L D L' of the first `k` unknowns of `matrix` (n, n), which is read
-        from its lower triangle; None for all n."""
+        """Factorise a symmetric matrix.
+
+        Args:
+            matrix: (n, n) matrix; only its lower triangle is read.
+            k: number of columns to eliminate; None for all n.
+        """
         n = range(matrix.shape[0])
         rows = [[matrix[i, j] for j in range(i + 1)] for i in n]
         self._below: list[dict[int, ca.SX]] = []  # the columns of L, without zeros

@@ -220,8 +220,10 @@ class HoldingHands(ContactModel):
 
     @property
     def problem(self) -> Problem | None:
-        """Key of the workcell file and message if a contact is a pad instead of a hand; else
-        None."""
+        """Reason why this contact model does not apply, as (key of the workcell file, message).
+
+        None if every contact is a hand; a pad is a reason.
+        """
         pads = [f"contacts[{i}]" for i, c in enumerate(self.workcell.contacts) if c.kind == "pad"]
         if pads:
             return (

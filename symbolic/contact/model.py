@@ -173,8 +173,10 @@ class ContactModel(ABC):
     @property
     @abstractmethod
     def problem(self) -> Problem | None:
-        """Key of the workcell file and message if the pads cannot hold the payload under every
-        motion; else None."""
+        """Reason why this contact model does not apply, as (key of the workcell file, message).
+
+        None if the contacts can hold the payload under every motion.
+        """
 
     @property
     def level_force(self) -> float:

@@ -33,8 +33,10 @@ class PaperContact(ContactModel):
 
     @property
     def problem(self) -> Problem | None:
-        """None if two round pads with opposite normals hold the payload; else key of the workcell
-        file and message."""
+        """Reason why this contact model does not apply, as (key of the workcell file, message).
+
+        None if two round pads with opposite normals hold the payload.
+        """
         workcell = self.workcell
         if workcell.has_facing_pads:
             return None

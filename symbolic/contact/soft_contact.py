@@ -41,8 +41,10 @@ class SoftFinger(ContactModel):
 
     @property
     def problem(self) -> Problem | None:
-        """Key of the workcell file and message if the pads are offset too far laterally to hold the
-        payload; else None."""
+        """Reason why this contact model does not apply, as (key of the workcell file, message).
+
+        None unless the pads are offset laterally by too much to hold the payload.
+        """
         friction = min(contact.friction for contact in self.workcell.contacts)
         beside, room = self.workcell.pad_offset, friction * self.workcell.pad_distance
         if beside < PAD_OFFSET_SHARE * room:
@@ -108,7 +110,10 @@ class SoftFingerGrasp(SoftFinger):
 
     @property
     def problem(self) -> Problem | None:
-        """Key of the workcell file and message if friction does not close the grasp; else None."""
+        """Reason why this contact model does not apply, as (key of the workcell file, message).
+
+        None if friction closes the grasp.
+        """
         if has_force_closure(self.workcell):
             return None
         return (

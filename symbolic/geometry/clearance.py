@@ -112,14 +112,19 @@ def screening_functions(
 
 
 def _piece_pose(placed: tuple[ca.SX, ca.SX] | None, turn: Any, centre: Any) -> tuple[ca.SX, ca.SX]:
-    """Compute the unit quaternion (4,), w x y z, and the position (3,) [m] of a piece in the world.
+    """Compute orientation and position of a piece of a body in the world.
 
     Args:
-        placed: rotation (3, 3) and position (3,) [m] in the world of the frame in which the piece
-            is given; None for a piece of a fixed body, which is given in the world.
-        turn: rotation of the piece. With `placed` it is a matrix (3, 3) in that frame, or None for
-            the identity. Without `placed` it is a quaternion (4,), w x y z.
-        centre: (3,) centre of the piece in the same frame as `turn` [m].
+        placed: world pose of the body's frame: rotation (3, 3) and position (3,) [m]. None for a
+            fixed body, whose pieces are given in the world.
+        turn: orientation of the piece. For a moving body: rotation matrix (3, 3) in the body's
+            frame, None for the identity. For a fixed body: unit quaternion (4,), w x y z, in the
+            world.
+        centre: (3,) centre of the piece [m], in the body's frame or, for a fixed body, in the
+            world.
+
+    Returns:
+        Unit quaternion (4,), w x y z, and position (3,) [m], both in the world.
     """
     position = ca.SX(number(centre))
     if placed is None:

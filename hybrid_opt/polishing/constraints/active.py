@@ -156,7 +156,7 @@ class RowSelector:
             carry: candidate after the step.
             known: candidate before the step.
             rows: the violated rows.
-            before: values that the rows of the last program had to exceed; 0 for a row not in it.
+            before: bound of each row in the last quadratic program, by row.
         """
         values: dict[Row, float] = {}
         for kind, own in self._by_kind(rows).items():

@@ -125,7 +125,7 @@ class ConstraintKind(ABC, Generic[AnyRow]):
             carry: candidate after the step.
             known: candidate before the step.
             rows: the violated rows.
-            before: values that the rows of the last program had to exceed; 0 for a row not in it.
+            before: bound of each row in the last quadratic program, 0 for a row that was not in it.
         """
         return self.required_values(carry, rows)
 
