@@ -176,7 +176,8 @@ def balanced_scalarisation(anchor: Array, span: Array) -> Scalarisation:
 def scalarisation_for(anchor: Array, span: Array, objective: int | None) -> Scalarisation:
     """Return the scalarisation that aims at an end of the front or at its balanced middle.
 
-    Both scale a peak force f, given over the reference force, to (f - anchor) / span.
+    A peak force f, given over the reference force, is scaled to (f - anchor) / span; for the
+    balanced middle both robots have the mean of `anchor` as origin.
 
     Args:
         anchor: (2,) origin of the scale of each peak force.
