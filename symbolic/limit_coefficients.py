@@ -374,7 +374,9 @@ def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
 
 
 def _inputs(workcell: Workcell, blocks: dict[str, ca.SX]) -> dict[str, ca.SX]:
-    """Return the inputs of the function `limit_forces` of `force_functions`, as symbols by name.
+    """Return the inputs of the function `limit_forces` of `force_functions`, as symbols by name:
+    `sample`, the coefficients in `blocks`; a = u'' and w = u'^2 [1/s^2]; then the payload's
+    parameters.
 
     Args:
         workcell: the cell.

@@ -148,7 +148,13 @@ def shape_table(
 
 
 def _measures(shape: ConvexShape) -> tuple[int, tuple[float, float, float]]:
-    """Return the kind and the sizes [m] of a convex shape in the numbering of `distances.cpp`."""
+    """Return the kind and the sizes of a convex shape in the form that `distances.cpp` takes.
+
+    Returns:
+        Number of the kind of shape: 0 for a box, 1 cylinder, 2 sphere, 3 capsule, 4 convex hull;
+        then three sizes [m]: half lengths of a box; radius and half length of a cylinder or
+        capsule; radius of a sphere. Sizes that a shape does not have are 0.
+    """
     match shape:
         case Box():
             x, y, z = (float(length) / 2.0 for length in shape.size)

@@ -76,14 +76,18 @@ class PlacedCarry:
 
 
 def local_minima_below(values: Array, limit: float, stride: int | None = None) -> list[int]:
-    """Return the index of the lowest value in every stretch, a run of successive values below a
-    limit.
+    """Find the lowest value in every stretch of a curve below a limit.
+
+    A stretch is a longest possible run of successive values below the limit.
 
     Args:
         values: (n,) values along the path.
-        limit: upper limit of the values in a stretch.
-        stride: if given, further indices are returned in each stretch: those at multiples of this
-            distance from the lowest value.
+        limit: the limit, in the unit of the values.
+        stride: distance, as a number of values, at which further places of each stretch are
+            returned on both sides of the lowest value; None for the lowest values alone.
+
+    Returns:
+        Indices of the values found.
     """
     below = values < limit
     if not below.any():
@@ -102,17 +106,19 @@ def local_minima_below(values: Array, limit: float, stride: int | None = None) -
 
 
 def interpolate_minima(clearance: Array) -> Array:
-    """Lower clearances at sampled places to the minima that are expected between the places.
+    """Estimate the minima of clearances between sampled places, and lower the samples beside them
+    to these minima.
 
-    Where a body passes an edge, the clearance falls linearly to a kink and rises linearly after it.
-    The lines through the two places before and the two places after the kink, extended, meet at the
-    minimum. Both neighbouring places are lowered to it.
+    While a body passes an edge, its clearance falls linearly to a kink and then rises linearly. The
+    minimum is the intersection of two lines: one through the last two samples before the kink, one
+    through the first two samples after it.
 
     Args:
-        clearance: (n, k) clearances [m] of k pairs at n successive places.
+        clearance: (n, k) clearances [m] of k pairs of bodies at n successive places.
 
     Returns:
-        (n, k) lowered clearances [m].
+        (n, k) clearances [m]. Where there is a kink between two samples, both are lowered to the
+        estimated minimum.
     """
     low = clearance.copy()
     if len(clearance) < 4:
@@ -162,14 +168,16 @@ class Distances:
         self._unmeasured = np.ones(bounds.shape, dtype=np.bool_)
 
     def closer_than(self, limits: Array) -> dict[int, Array]:
-        """Measure the distances that may be below the limits of their pairs.
+        """Find the pairs of bodies that may be closer than their limits, and measure their
+        distances.
 
         Args:
             limits: (n_pairs,) limit of each pair [m].
 
         Returns:
-            Distances (n,) of each such pair at all places [m], by index of the pair. Where the
-            lower bound reaches the limit, it stands in place of the distance.
+            By index of the pair, distances (n,) at all places [m], for each pair whose lower bound
+            is below its limit at some place. Distances are measured at these places; elsewhere a
+            lower bound may take the place of the distance.
         """
         close = self.interpolated_clearance < limits
         self._measure_pairs(*(close & self._unmeasured).nonzero())
@@ -188,15 +196,16 @@ class Distances:
         self._unmeasured[places, pairs] = False
 
     def least(self, stretches: Sequence[Stretch], below: float) -> list[float]:
-        """Return the least distance in each stretch of places [m].
+        """Return the least distance [m] in each of several stretches of the path.
 
         In a stretch the distance with the lowest bound is measured first, then the next one, until
-        a measured distance is below all remaining bounds.
+        a measured distance is below all remaining bounds. If all bounds of a stretch reach `below`,
+        the least bound is returned.
 
         Args:
             stretches: for each stretch, the slice of its successive places and the index of the
-                pair.
-            below: only distances with lower bounds below this are measured [m].
+                pair of bodies.
+            below: only distances with lower bounds below this one are measured [m].
         """
         open_, found = list(range(len(stretches))), [np.inf] * len(stretches)
         while open_:
@@ -213,12 +222,13 @@ class Distances:
         return found
 
     def exceed(self, limits: Array) -> bool:
-        """Return True if the distances of all pairs reach the limits of their pairs at all places.
+        """Return True if no pair of bodies is closer than its limit at any place.
 
-        Distances with the lowest bounds are measured first, until one is below its limit.
+        Distances are measured in order of their lower bounds, the least first. A distance below its
+        limit ends the search.
 
         Args:
-            limits: (n_pairs,) limit of each pair [m].
+            limits: (n_pairs,) least allowed distance of each pair [m].
         """
         places, pairs = (self.interpolated_clearance < limits).nonzero()
         order = np.argsort(self.interpolated_clearance[places, pairs], kind="stable")

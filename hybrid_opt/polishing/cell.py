@@ -115,8 +115,11 @@ class PolishFunctions:
     def gaps(self, pair: int, pose: Array) -> Array:
         """Compute the gaps between the payload and an obstacle box along several directions.
 
+        A gap is the distance between the projections of both bodies onto the direction, negative if
+        the projections overlap. The largest gap is a lower bound of the distance of the bodies.
+
         Args:
-            pair: index of the pair, one of `separable`.
+            pair: index of the pair of payload and obstacle, one of `separable`.
             pose: (n, 6) box poses [m, rad].
 
         Returns:
@@ -126,12 +129,12 @@ class PolishFunctions:
 
 
 def sample_quantities(workcell: Workcell) -> tuple[Quantity, ...]:
-    """Return the names of the quantities that the polish of a cell evaluates at samples: 'force',
-    'pressure' or 'load'.
+    """Return what the polish of a cell evaluates at the samples of a carry, by name.
 
-    Drivable cells have none, because their limits apply at the intervals of the timing. Pads whose
-    forces have no closed form have 'load': the force and moment that the box needs. A convex
-    program computes the forces from it.
+    The names are 'force' (normal forces) and, if it is limited, 'pressure' (shift of the centre of
+    pressure). Pads whose forces have no closed form have 'load' instead: the force and moment that
+    the box needs, from which a convex program computes the forces. Drivable cells have none,
+    because their limits apply at the intervals of the timing.
 
     Args:
         workcell: the cell.
@@ -201,9 +204,10 @@ def _held(model: CellModel) -> dict[str, ca.Function]:
 
 
 def _driven_held(model: CellModel) -> dict[str, ca.Function]:
-    """Build the functions of grasp forces, with the barrier weight that the timing uses.
+    """Build the functions that compute the pads' forces by a convex program.
 
-    So polish and timing compute equal forces.
+    The weight of the program's logarithmic barrier is that of the timing, so that polish and timing
+    compute equal forces.
 
     Args:
         model: arms and bodies of the cell.
@@ -352,8 +356,10 @@ class SmoothCell:
         return float(np.max(np.abs(end - start) / self.half))
 
     def waypoints(self, x: Array) -> Array:
-        """Return the waypoints of a decision vector, as `extended_waypoints` does, but in less time
-        where no angle jumps by more than pi.
+        """Return the waypoints of a decision vector.
+
+        They equal those of `extended_waypoints`, which is called only if an angle changes by more
+        than pi between two waypoints; otherwise this method is faster.
 
         Args:
             x: (n_var,) decision vector.

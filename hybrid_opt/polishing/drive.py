@@ -116,8 +116,8 @@ def is_polishable(workcell: Workcell, robust: bool) -> bool:
 def force_range(driver: CandidateDriver) -> tuple[float, float]:
     """Return the least and the largest force limit of the task [N].
 
-    If the limit applies to robust forces, the least limit at least suffices to hold the box at rest
-    at both ends of the path.
+    If the limit applies to robust forces, the least limit is raised, where necessary, to the force
+    that holds the box at rest at both ends of the path.
     """
     workcell = driver.timer.workcell
     least, most = workcell.task.force_limit
@@ -175,13 +175,15 @@ class _StepAnswer:
     linear: LinearisedRows
 
     def multipliers_of(self, linear: LinearisedRows) -> Array:
-        """Return the multipliers (n + rows,) of the n bounds, then of the rows in `linear`.
-
-        The rows belong to the same quadratic program, but may differ from those of this solution.
-        Rows that this solution did not have get 0.
+        """Arrange the multipliers of this solution for another selection of rows of the same
+        quadratic program.
 
         Args:
-            linear: linearised rows.
+            linear: the selected rows, linearised.
+
+        Returns:
+            Multipliers (n + rows,) of the n bounds, then of the selected rows; 0 for rows that were
+            not in the program of this solution.
         """
         timing = np.zeros(linear.shape)
         timing[self.linear.point, self.linear.kind] = self.answer.rows[: len(self.linear.point)]

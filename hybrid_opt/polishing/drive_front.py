@@ -115,8 +115,10 @@ class DriveRun(PolishRun[DriveAttempt]):
         on_progress: Callable[[int, int], None],
         paths: Array,
     ) -> None:
-        """Evaluate at rest the paths of the archive, the hand-made one and further ones, to find
-        the least force limit of the front.
+        """Find the least force limit with which any known path can hold the box at rest; the front
+        starts there.
+
+        Known paths are those of the archive, the hand-made one and `paths`.
 
         Args:
             drive_method: step method of drivable carries.
@@ -197,14 +199,15 @@ class DriveRun(PolishRun[DriveAttempt]):
         return DriveAttempt("gap", -1, x, self._evaluator.evaluate(x).objectives[0], moves)
 
     def _rotated(self, force: float) -> list[Array]:
-        """Return paths (n_path,) in which the box is rotated at the waypoints of the workcell file.
+        """Return paths (n_path,) that start solves with another tilt of the box at the waypoints of
+        the workcell file.
 
-        The fastest known path and the hand-made one are rotated, in every direction. For pads whose
-        pressure may shift within the patches, the tilt of the box decides in which basin a solve
-        ends.
+        They are the fastest known path and the hand-made one, each with the box rotated in both
+        directions about every axis. For pads whose pressure may shift within the patches, the tilt
+        decides in which basin a solve ends.
 
         Args:
-            force: force limit [N] at which the rotated paths need a timing.
+            force: force limit [N]; paths without a timing within it are left out.
         """
         paths, durations = self._known_paths(force)
         best = paths[int(np.argmin(durations))]
@@ -299,12 +302,12 @@ class DriveRun(PolishRun[DriveAttempt]):
     def _limits(self, least: float, fast: float, count: int) -> list[float]:
         """Return increasing force limits [N] for the sweep.
 
-        Their excess over the force at rest, which decides the duration, grows geometrically. Beyond
-        `fast` further limits in this ratio follow, up to the largest limit of the front.
+        Their excess over the force at rest, on which the duration depends, grows by a constant
+        ratio. Limits above `fast` follow with the same ratio, up to the largest limit of the front.
 
         Args:
             least: first limit [N].
-            fast: last limit of the first part [N].
+            fast: limit that is reached after `count` limits [N].
             count: number of limits from `least` to `fast`.
         """
         low, high, most = np.array([least, fast, self._largest]) - self._still
@@ -316,7 +319,8 @@ class DriveRun(PolishRun[DriveAttempt]):
         return sorted(set(limits))
 
     def _known_paths(self, force: float) -> tuple[Array, Array]:
-        """Return all known paths (n, n_path), and their durations (n,) [s] within a force limit.
+        """Return all known paths (n, n_path), and their shortest durations (n,) [s] within a force
+        limit; infinite for a path without a timing.
 
         Args:
             force: the force limit [N].
@@ -326,8 +330,11 @@ class DriveRun(PolishRun[DriveAttempt]):
         return paths, self._driver.durations(paths, force)
 
     def _widest_gap(self) -> DriveGap | None:
-        """Return the widest gap on the front whose force limit was not tried yet; None if there is
-        none."""
+        """Return the widest gap between neighbouring points of the front, with a force limit
+        between those of both points.
+
+        Gaps in which this force limit was tried already are left out. None if no wide gap remains.
+        """
         # What is not polished yet fills no gap: it is to be improved.
         rows = [k for k in self._archive.front_indices() if self._archive.polished[k]]
         if len(rows) < 2:

@@ -101,14 +101,15 @@ class Scalarisation:
 
     @property
     def limits(self) -> MinimisedForces:
-        """For each robot, True if its peak force is minimised by way of the level a; False if it
-        only decides between equal levels.
+        """For each robot, True if its peak force bounds the level a that is minimised; False if the
+        peak force only has a small weight, which decides between solutions with equal levels.
         """
         first, second = (self.offset < UNBOUNDED_OFFSET).tolist()
         return first, second
 
     def least_level(self, phi: Array) -> float:
-        """Return the least level a that scaled peak forces allow.
+        """Return the least value of the level a that satisfies phi_j <= direction_j a + offset_j
+        for given scaled peak forces phi_j.
 
         Args:
             phi: (2,) scaled peak force of each robot.
@@ -320,8 +321,8 @@ class ForceProgram:
     def residuals_at(self, x: Array, carry: PlacedCarry) -> Residuals:
         """Compute the optimality residuals of a candidate with least-squares multipliers.
 
-        Only the variables' own bounds count as constraints. Bounds of the trust region would absorb
-        the remaining reduction.
+        Only the variables' own bounds count as constraints. With the bounds of the trust region,
+        every candidate at their edge would look optimal.
 
         Args:
             x: (n_var,) decision vector of the candidate.
@@ -334,8 +335,8 @@ class ForceProgram:
         return optimality_residuals(self, z, (low, high))
 
     def candidate(self, z: Array) -> Array:
-        """Return the decision vector (n_var,) in the program's variables z (n_variables,), clipped
-        to its bounds and to the trust region.
+        """Extract the decision vector (n_var,) from the program's variables z (n_variables,), and
+        clip it to its bounds and to the trust region.
         """
         n = self._n
         return self._cell.unscaled(np.clip(z[:n], self.low[:n], self.high[:n]))

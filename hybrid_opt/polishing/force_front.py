@@ -132,18 +132,18 @@ def extreme_attempt(
 ) -> ForceAttempt:
     """Return an attempt at an end of the front or at its balanced middle.
 
-    It starts from the best point so far. If that was tried or the last attempt brought no progress,
-    an attempt at an end starts from a perturbation of the best point, because ends lie in several
-    basins. An attempt at the middle then starts from another point at random, which may be
-    dominated.
+    The attempt starts from the best known point. If this start was tried already, or if the last
+    attempt brought no progress, it starts elsewhere: at an end from a random perturbation of the
+    best point, because ends lie in several basins; at the middle from a random untried point of the
+    archive, which may be dominated.
 
     Args:
-        archive: the front so far.
+        archive: the points of the front and other known points.
         objective: index of the objective that is least at the end; None for the balanced middle.
         tried: objective and start, as bytes, of all attempts so far.
-        stalled: whether the last attempt brought no progress.
+        stalled: True if the last attempt brought no progress.
         perturb: function from a decision vector and an objective to a perturbed start.
-        rng: generator that chooses the other point.
+        rng: generator that chooses the untried point.
     """
     radius, k = RADIUS, archive.best(objective)[0]
     fresh = [row for row, x in enumerate(archive.x) if (objective, x.tobytes()) not in tried]
@@ -188,8 +188,13 @@ def probe_attempt(start: Start, objective: int | None) -> ForceAttempt:
 
 
 def better_half(reached: list[Start], objective: int | None) -> list[Start]:
-    """Return the better half of the candidates, the best first; none if there is only one. They are
-    compared by the objective with this index, or by the sum of both objectives for None.
+    """Return the better half of some candidates, the best first; none if there is only one
+    candidate.
+
+    Args:
+        reached: the candidates.
+        objective: index of the objective by which they are compared; None for the sum of both
+            objectives.
     """
     ranked = sorted(reached, key=lambda start: start.value(objective))
     return ranked[: len(reached) // 2]
@@ -247,20 +252,22 @@ def gap_attempt(
     stride: float = STRIDE,
     far: float = FAR_GAP,
 ) -> GapAttempt | None:
-    """Return an attempt in the widest gap, from a side from which none started yet.
+    """Return an attempt to find a point in the widest gap of the front, from an end of the gap at
+    which none started yet.
 
-    If solves from both sides failed, because the front jumps there, and the gap is wider than
-    `far`, the attempt aims at the gap's middle with a large radius.
+    If solves from both ends failed, because the front jumps there, and the gap is wider than `far`,
+    the attempt aims at the gap's middle with a large radius.
 
     Args:
-        archive: the front so far.
-        tried: sides of gaps from which attempts started.
-        solved: number of points from which on the front is complete.
-        stride: largest distance along the front from start to aim [front's extent].
+        archive: the points of the front and other known points.
+        tried: ends of gaps at which attempts started.
+        solved: number of points with which the front is complete.
+        stride: largest distance along the front from the start to the point that is aimed at
+            [front's extent].
         far: width of a gap above which the large radius is tried [front's extent].
 
     Returns:
-        The attempt; None if the front is complete, or all sides of gaps were tried.
+        The attempt; None if the front is complete, or all ends of gaps were tried.
     """
     found = gaps(archive)
     if len(found) + 1 >= solved:
@@ -373,9 +380,10 @@ class ForceRun(PolishRun[ForceAttempt]):
     def attempts(self, rng: np.random.Generator) -> Iterator[ForceAttempt]:
         """Yield all attempts of the polish.
 
-        They are: at points of the front; short probes far from it; at its ends and its middle in
-        turns; in its gaps. Mirror images of results are added at once. These and points on chords
-        are certified in the end.
+        Attempts improve points of the front first. Short solves then look for better basins far
+        from the front. Attempts at the ends and the middle of the front follow in turns, and
+        attempts in its gaps last. For a symmetric cell the mirror image of each result is added at
+        once. Mirror images, and points on the lines across gaps, are certified at the end.
 
         Args:
             rng: generator of random starts.
@@ -407,9 +415,15 @@ class ForceRun(PolishRun[ForceAttempt]):
             self._certify_unproven()
 
     def _probes(self, objective: int | None, rng: np.random.Generator) -> Iterator[ForceAttempt]:
-        """Yield short solves far from the front, by successive halving. They start from random
-        feasible candidates and from the best point for `objective` (None: the balanced middle),
-        then from the better half of the results, until one is left.
+        """Yield short solves far from the front, by successive halving.
+
+        The first ones start from random feasible candidates and from the best known point, the next
+        ones from the better half of the results, until one is left.
+
+        Args:
+            objective: index of the objective that is least at the end of the front; None for its
+                balanced middle.
+            rng: generator of random starts.
         """
         count = self._starts(objective)
         if not count:
@@ -430,8 +444,13 @@ class ForceRun(PolishRun[ForceAttempt]):
             pool = better_half(reached, objective)
 
     def _starts(self, objective: int | None) -> int:
-        """Return the number of starts of short solves towards the end of the front with this
-        objective (its index; None: the balanced middle): at most twice the remaining attempts."""
+        """Return the number of starts of short solves towards a part of the front, at most twice
+        the number of remaining attempts.
+
+        Args:
+            objective: index of the objective that is least at the end of the front; None for its
+                balanced middle.
+        """
         probe = self._settings.probe
         count = probe.starts if self._mirror is not None else (probe.starts + 1) // 2
         return min(2 * self._ahead, probe.middle_starts if objective is None else count)
@@ -480,8 +499,10 @@ class ForceRun(PolishRun[ForceAttempt]):
         return gaps(self._archive)[place - 1].width > FAR_GAP
 
     def _gaps(self, solved: int) -> Iterator[ForceAttempt]:
-        """Yield attempts that fill gaps, until the front has `solved` points or attempts started
-        from all sides of gaps; then add points on the lines across the remaining gaps."""
+        """Yield attempts that fill gaps, until the front has `solved` points or attempts started at
+        both ends of every gap. Then add points on the straight lines between the decision vectors
+        of the gaps' ends.
+        """
         tried: set[Edge] = set()
         self._most_attempts += self._settings.fill.attempts * self._settings.attempts
         while self._attempts_left() > 0:
@@ -512,7 +533,9 @@ class ForceRun(PolishRun[ForceAttempt]):
                 self._add_image(found[0])
 
     def _reflected(self, edge: Edge) -> Edge:
-        """Return the mirror image of one side of a gap; the side itself without mirror symmetry."""
+        """Return the mirror image of an end of a gap, from which an attempt starts; `edge` itself
+        for a cell without mirror symmetry.
+        """
         start, across, near = edge
         return self._reflected_bytes(start), self._reflected_bytes(across), near
 

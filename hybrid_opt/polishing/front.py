@@ -64,8 +64,8 @@ class ParetoArchive:
         self.x[index], self.objectives[index], self.polished[index] = x, objectives, True
 
     def dominates(self, objectives: Array) -> bool:
-        """Return True if a point of the archive is at least as good in both objectives (2,) as the
-        given ones.
+        """Return True if a point of the archive is at least as good as given objectives (2,) in
+        each of them.
         """
         return bool(np.any(np.all(np.array(self.objectives) <= objectives, axis=1)))
 

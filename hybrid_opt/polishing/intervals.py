@@ -84,11 +84,12 @@ class PointInequalities:
         return cls(mix, is_force, where, np.take_along_axis(mix, where, axis=1))
 
     def slopes(self, slope: Array, point: NDArray[np.intp], kind: NDArray[np.intp]) -> Array:
-        """Return the derivatives (rows, n) of the left sides of some inequalities at some points.
+        """Return the derivatives (rows, n) of the left sides of chosen inequalities.
 
         Args:
             slope: (points, quantities, n) derivatives of the quantities by n variables.
-            point, kind: (rows,) index of the point and of the inequality of each row.
+            point, kind: (rows,) index of the point, and of the inequality at this point, of each
+                chosen row.
         """
         terms = zip(self.where.T, self.weight.T, strict=True)
         return sum(
@@ -152,13 +153,14 @@ class IntervalGrid:
         self.variables = self.layout.variables
 
     def by_path(self, slope: Array, points: NDArray[np.intp]) -> Array:
-        """Convert derivatives by the extended pose and its two derivatives by u to derivatives by
-        the path variables of the quadratic program.
+        """Convert derivatives by the motion at a point to derivatives by the path variables of the
+        quadratic program.
 
-        The extended pose is the box pose followed by the redundant joints.
+        The motion is the box pose followed by m redundant joints, with its first and second
+        derivative by u: 3 (6 + m) numbers.
 
         Args:
-            slope: (rows, moving) derivatives of one value per row.
+            slope: (rows, 3 (6 + m)) derivatives of one value per row by the motion.
             points: (rows,) index of each row's point.
 
         Returns:
@@ -241,16 +243,18 @@ class IntervalValues:
         self.value, self.slope = value, slope
 
     def at_rest(self, force: float) -> tuple[Array, Array]:
-        """Compute which share of a limit the box at rest uses, at the beginning of every interval.
+        """Compute which share of its limit each contact uses while the box is at rest at the
+        beginning of every interval.
 
-        The limit is the pressure shift; for pads without a pressure limit it is the force limit.
+        What is limited is the pressure shift; for pads without a limit on pressure it is the normal
+        force.
 
         Args:
             force: the force limit [N].
 
         Returns:
-            Used shares (rows,), and their derivatives (rows, moving) by the extended pose (box pose
-            and redundant joints) and its two derivatives by u.
+            Used shares (rows,), and their derivatives (rows, moving) by the box pose with redundant
+            joints and by its first and second derivative by u.
         """
         begins = [values[::2] for values in self._inputs]
         still, grid = np.zeros(len(begins[-1])), self._grid
@@ -471,8 +475,8 @@ class PathTimingProgram:
         self._speeds(squared)
 
     def _still(self, values: IntervalValues) -> None:
-        """Append rows that limit the forces or pressure of the box at rest to the geometric rows.
-        Their small curvature is neglected.
+        """Add inequalities on the forces or the pressure of the box at rest to the program's
+        geometric rows. Their curvature is small and neglected.
 
         Args:
             values: limited quantities of the iterate.
@@ -485,8 +489,8 @@ class PathTimingProgram:
         self._geometry_slope = np.concatenate([self._geometry_slope, by_path])
 
     def _speeds(self, w: Array) -> None:
-        """Store the duration, and the derivatives of the duration and of u'' and u'^2 at each point
-        by the relative speed changes omega.
+        """Compute and store the duration, and derivatives by omega, the relative changes of the
+        iterate's squared speeds: of the duration, and of u'' and u'^2 at each point.
 
         Args:
             w: (intervals + 1,) squared path speeds u'^2 of the iterate [1/s^2].

@@ -93,11 +93,12 @@ class TrustRegion:
         self.radius = min(self.radius, length) * factor
 
     def on_reject(self, is_new: bool, length: float = np.inf) -> None:
-        """Halve the radius after a rejected step.
+        """Shrink the radius after a step that was rejected because it violates rows (scalar
+        inequalities).
 
         Args:
-            is_new: True if a violated row (scalar inequality) was not in the program; the radius
-                then stays, because the program was wrong.
+            is_new: True if a violated row was not in the program. The radius then stays, because
+                the incomplete program caused the violation. False halves the radius.
             length: largest change of a scaled variable in the step, from which the radius is halved
                 if it is smaller than the radius.
         """

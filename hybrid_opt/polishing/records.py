@@ -125,8 +125,10 @@ class PolishedFront:
 
     @property
     def widest_gap(self) -> float:
-        """Largest distance between neighbours, as a share of the front's length along both
-        objectives; NaN for fewer than two points."""
+        """Largest distance between neighbouring points, as a share of the front's length. Both are
+        sums over the objectives, each divided by its range over the front. NaN for fewer than two
+        points.
+        """
         if len(self.objectives) < 2:
             return float("nan")
         sides = np.abs(np.diff(self.objectives, axis=0))

@@ -57,8 +57,8 @@ class RobustSamples:
         """Compute the robust forces (n, 2) [N] of both robots at n samples.
 
         Args:
-            found: the evaluator's outputs for one candidate, of which pose, rate and second rate
-                (n, 6) are used.
+            found: the evaluator's outputs for one candidate, of which the box pose and its first
+                and second time derivative ('pose', 'rate' and 'second_rate', (n, 6)) are used.
         """
         motion = BoxMotion(*[found[name] for name in ("pose", "rate", "second_rate")])
         return self._governing(motion).force

@@ -129,8 +129,8 @@ class _SampleRows:
             quantity: name of the quantity: force, pressure or load.
             wanted: indices of the needed samples. A function that serves several samples is called
                 if any of them is needed.
-            beyond: number of further rows of `found` behind the samples, which another function
-                writes.
+            beyond: number of rows that are appended to the arrays `found` and `gradients`, for
+                values that a convex program computes.
         """
         built = cell.functions.built
         chosen = [
@@ -169,7 +169,8 @@ class _SampleRows:
 
 
 def _all_directions(second: NumericFunction, n: int, n_var: int) -> PreparedBatch:
-    """Prepare the second derivatives of a quantity at n samples along every direction of x.
+    """Prepare a call of a function that computes second derivatives at n samples, one direction of
+    x at a time, for all directions.
 
     Args:
         second: function that evaluates second derivatives along one direction.

@@ -62,8 +62,8 @@ def first_feasible(
         evaluator: evaluator of the candidates.
         x: (n, n_var) candidates.
         count: largest number of candidates to find.
-        objective: index of the objective by which candidates are sorted before, lowest first; None
-            keeps their order.
+        objective: index of the objective by which the candidates are sorted first, lowest first;
+            None to take them in the given order.
 
     Returns:
         Indices (k,) into x and objectives (k, n_obj) of the feasible candidates.
@@ -187,10 +187,11 @@ class Mirror:
 
 
 def mirror_of(workcell: Workcell) -> Mirror | None:
-    """Return the reflection about the plane that halves the line between both bases.
+    """Return the reflection that exchanges both arms: about the vertical plane midway between their
+    bases.
 
-    None if the line is not parallel to a horizontal world axis, if the arms have redundant joints,
-    or if the reflection moves a fixed waypoint of the box.
+    None if the line between the bases is not parallel to a horizontal world axis, if the arms have
+    redundant joints, or if the reflection moves a fixed waypoint of the box.
     """
     task = workcell.task
     first, second = (robot.T_world_base[:3, 3] for robot in workcell.robots)

@@ -90,17 +90,18 @@ def commanded_margins(carry: Carry, forces: Array) -> tuple[Margin, ...]:
     enough, nominal = forces[rows, 1 - LEADER] * (1.0 + HOLDS), nominal_case(workcell)
 
     def last(change: Array, end: float) -> tuple[float, str]:
-        """Find the largest multiple of a change of the cell's nominal values at which the forces
-        still hold the box.
+        """Find the largest multiple of a deviation of the cell at which the commanded forces still
+        hold the box.
 
-        The needed force has to rise with the multiple.
+        The force that the box needs has to grow with the multiple.
 
         Args:
-            change: (18,) change of the nominal case.
+            change: (18,) deviation from the nominal case, laid out by
+                `symbolic.contact.worst_cases.CASE_SIZES` [SI units].
             end: largest multiple that is tried.
 
         Returns:
-            The multiple; and the name of the failure beyond it, '' if the multiple is `end`.
+            The multiple; and what fails beyond it, '' if the multiple is `end`.
         """
         low, high = 0.0, end
         for step in range(MARGIN_BISECTIONS):
@@ -162,11 +163,12 @@ def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tu
         slope = float((durations[high] - durations[low]) / (forces[high] - forces[low]))
 
     def in_time(force: float) -> float:
-        """Convert a change of the commanded force to a change of the duration [s].
+        """Return the change of the duration [s] that is worth as much as a change of the commanded
+        force.
 
         Args:
-            force: change of the commanded force at the same duration [N]. The result is the change
-                of the duration at the same commanded force.
+            force: change of the commanded force at an unchanged duration [N]. The result is the
+                change of the duration at an unchanged commanded force.
         """
         spare = float(np.interp(option.commanded - force, forces, durations))
         lost = max(forces[0] - (option.commanded - force), 0.0)
@@ -180,11 +182,11 @@ def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tu
 
 
 def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str, float]]:
-    """Yield small changes of the cell as text, each with the rise of the largest commanded force
-    along a motion [N]; a fall is negative.
+    """Yield small changes of the cell as text, each with the resulting change of the largest
+    commanded force along a motion [N], negative if the force falls.
 
-    A larger cup also holds more: the commanded force of the changed cell is then divided by the
-    ratio of the new to the present holding force.
+    If all contacts are suction cups, larger cups are among the changes. They also hold more, so the
+    force of the changed cell is divided by the ratio of their holding force to the present one.
 
     Args:
         workcell: the cell.
@@ -279,12 +281,8 @@ def _larger(cup: Contact) -> Contact:
 
 
 def _strength(workcell: Workcell, other: Workcell) -> float:
-    """Return the weakest holding force of one cell over that of another cell; 1 for pads, which
-    have no holding force.
-
-    Args:
-        workcell: the cell whose holding force is the denominator.
-        other: the cell whose holding force is the numerator.
+    """Return the ratio of the weakest holding force of `other` to that of `workcell`; 1 for pads,
+    which have no holding force.
     """
     own, new = (min(c.holding_force for c in cell.contacts) for cell in (workcell, other))
     return new / own if own else 1.0

@@ -90,7 +90,7 @@ class Wish:
 
     @property
     def has_target(self) -> bool:
-        """Return True if a duration or a force is given."""
+        """True if the user gave a duration or a force."""
         return self.duration is not None or self.force is not None
 
     @property
@@ -166,8 +166,9 @@ class Goal:
 
     @classmethod
     def of(cls, wish: Wish, workcell: Workcell) -> Goal:
-        """Convert a user's wish to limits and a cost. Each robot's force is always limited by its
-        reference force.
+        """Convert a user's wish to limits and a cost.
+
+        Each robot's force is limited by its reference force, also if the wish states no force.
 
         Args:
             wish: the user's target.
@@ -183,11 +184,13 @@ class Goal:
 
 
 def commanded_at_most(force: float, others: Array | float = np.inf) -> Array:
-    """Return the largest allowed normal force (2,) of each robot [N] if the commanded force is
-    limited.
+    """Return the upper bound (2,) of each robot's normal force [N] that limits the commanded force.
+
+    The entry of the force-controlled arm is `force`, or `others` if that is less; the entry of the
+    position-controlled arm is `others`.
 
     Args:
-        force: largest allowed force of the force-controlled arm [N].
+        force: largest allowed commanded force [N].
         others: further upper bound of the forces, one for both robots or one per robot (2,) [N].
     """
     found = np.broadcast_to(others, 2).astype(float)
@@ -318,11 +321,12 @@ class DrivenPaths:
         """Compute timings of every path: one within the path's own force limit, and one within each
         of `FORCES` further limits.
 
-        The further limits lie between a little more than the force at rest and `highest_force`. If
-        force limits bound robust forces, only the timings within the own limits are computed.
+        The further limits lie between the force at rest, plus a small margin, and `highest_force`.
+        If force limits apply to robust forces, there are no further limits.
 
         Args:
-            own: own force limit [N]: one per path (k,), or one for all paths.
+            own: force limit with which each path was found [N]: one per path (k,), or one for all
+                paths.
             told: function without arguments that advances a progress display; it is called `FORCES`
                 times.
         """

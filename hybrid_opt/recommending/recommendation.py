@@ -123,7 +123,7 @@ class Recommendation(Displayable):
 
     @property
     def fits(self) -> bool:
-        """Return True if the required forces are within the reference forces."""
+        """True if the required forces are within the reference forces."""
         return is_within(self.required, self.budget.allowed)
 
     @property
@@ -150,7 +150,7 @@ class Recommendation(Displayable):
 
     @property
     def limit(self) -> float:
-        """Force limit of the carry in the search [N]."""
+        """Force limit of the carry [N]: the last entry of `x`, with which the search found it."""
         return float(self.x[-1])
 
     @property
@@ -192,7 +192,7 @@ def recommend(
             hand-made path is always compared.
         progress: True for a progress bar, or a function of the finished and the total number of
             steps.
-        alone: True to leave out margins, rivals and advice.
+        alone: True to leave out the margins, the comparison with other paths and the advice.
 
     Raises:
         SettingsError: the cell is not drivable, the front is empty, no member fulfils the wish, or
@@ -292,12 +292,13 @@ def _require_members(cell: Cell, front: Front) -> None:
 def _driven(
     cell: Cell, paths: DrivenPaths, options: Sequence[Option], goal: Goal, wished: bool
 ) -> tuple[Option, Timing, bool]:
-    """Choose the carry to recommend, after timing the best paths without jumps of acceleration.
+    """Choose the carry to recommend. The best paths are timed again without jumps of acceleration,
+    because robots drive such a timing.
 
     Args:
         cell: drivable cell.
         paths: paths of the front.
-        options: timings with jumps of acceleration, of these paths within several force limits.
+        options: timings of these paths within several force limits; their accelerations jump.
         goal: limits on duration and force, and the cost to minimise.
         wished: True if the user gave a duration or force. If False and no carry keeps the limits,
             the carry is chosen that exceeds the force limits least.
@@ -539,8 +540,8 @@ def commanded_durations(paths: DrivenPaths, limits: Array | float, forces: Array
 
 
 def spread_rows(paths: Array) -> NDArray[np.intp]:
-    """Return indices of at most `MEMBERS` distinct rows of an array (k, n_path) of paths; the
-    indices are evenly spread and include the first and the last distinct row.
+    """Choose at most `MEMBERS` distinct rows of an array (k, n_path) of paths, evenly spread, the
+    first and the last distinct row among them. Return their indices in increasing order.
     """
     different = np.sort(np.unique(paths, axis=0, return_index=True)[1])
     return np.asarray(different[evenly(len(different), MEMBERS)])

@@ -304,7 +304,12 @@ class GoverningForce:
         return self._inputs(self._workcell, self._motion, pads=True)
 
     def _inputs(self, cell: Workcell, motion: BoxMotion, pads: bool) -> Array:
-        """Compute the m inputs of `_gradient` for another cell.
+        """Compute the quantities on which the commanded force depends, for another cell.
+
+        There is one row for each of the k cases that need the largest force. It contains the box
+        pose [m, rad], its first and second derivative by time, and the case of the uncertainty;
+        then, for pads with opposite normals, the cell's parameters, else the load on the box.
+        Entries have SI units.
 
         Args:
             cell: the other cell.
@@ -312,9 +317,9 @@ class GoverningForce:
             pads: True if the other cell's pads differ from this cell's.
 
         Returns:
-            Inputs (k, m), one row for each of the k cases that need the largest force. If `pads` is
-            True and the pads' normals are not opposite, the normal forces (k, 1) of the
-            force-controlled arm [N] instead.
+            (k, m) quantities, in the order of the last axis of `_gradient`. If `pads` is True and
+            the pads' normals are not opposite, `_gradient` does not apply: the result then is the
+            normal force (k, 1) of the force-controlled arm [N].
         """
         cases = worst_cases(command_model(cell), cell.uncertainty, self._leader)
         assert len(cases) == self._count, "no range of the uncertainty begins or ends"

@@ -249,14 +249,20 @@ def time_trajectory(
     own: TimingModel | None = None,
     progress: ShowProgress = False,
 ) -> TimedTrajectory:
-    """Compute all timings of one decision vector that apply to the workcell's time law.
+    """Compute the timings of one trajectory that a report compares.
+
+    They are, by name in the result: 'search', the timing under which the search found x; 'closest
+    to reference', the fastest one within the task's reference speeds; 'fastest'; with `force_limit`
+    also 'force limited'. A drivable carry in a workcell with jerk limits also has 'within jerk
+    limits'.
 
     Args:
-        model: timing model of the drivable workcell.
+        model: timing model of the workcell, usually with the drivable time law.
         x: (n_var,) decision vector.
-        force_limit: normal force [N] for one more timing within this limit; None for no such
-            timing.
-        curve_points: points of the curve of duration against force limit; None for no curve.
+        force_limit: upper bound of the normal forces [N] for the timing 'force limited'; None
+            leaves this timing out.
+        curve_points: number of points of the curve of duration against force limit; None for no
+            curve.
         own: timing model of the workcell in which the search found x, if that has another time law;
             None if it is `model`.
         progress: True for a progress bar, or a function of the finished and the total number of

@@ -39,10 +39,13 @@ class PathLimits:
         self._grasped = limits.robust and not self._squeezed
 
     def joint_accelerations(self) -> tuple[Array, Array]:
-        """Return the derivatives of the joint accelerations, over their limits, by u'' and by u'^2,
-        (n, all joints) each.
+        """Return the coefficients of the joint accelerations, relative to their limits.
 
-        The limits apply to both signs.
+        A joint's acceleration is q' u'' + q'' u'^2 with derivatives q' and q'' by u. It stays
+        within its limit if first u'' + second u'^2 lies between -1 and 1.
+
+        Returns:
+            The arrays first and second [s^2], (n, all joints) each.
         """
         first, second = self._derivatives(JOINT_ACCELERATION)
         bound = self._bounds[JOINT_ACCELERATION.name]

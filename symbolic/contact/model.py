@@ -322,8 +322,14 @@ class ContactModel(ABC):
         return planned + np.multiply.outer(extra, self.internal_force_ratio(leader))
 
     def displacement_margin(self, uncertainty: Uncertainty) -> float:
-        """Return how much farther the pads may be displaced than the uncertainty says until forces
-        can no longer be computed [m]. Zero or negative if the uncertainty goes too far already."""
+        """Return by how much the pads' displacement could exceed that of an uncertainty before
+        forces can no longer be computed [m]; infinite for a model that allows any displacement.
+
+        Zero or negative if the displacement of the uncertainty itself is already too large.
+
+        Args:
+            uncertainty: ranges of the uncertain quantities, pad displacements among them.
+        """
         return np.inf
 
     # --- jobs ---

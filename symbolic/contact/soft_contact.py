@@ -146,8 +146,16 @@ class SoftFingerGrasp(SoftFinger):
         return uncertainty.centre_of_mass, np.array([off * np.array(at) for at in signs])
 
     def displacement_margin(self, uncertainty: Uncertainty) -> float:
-        """Return how much farther the pads may be displaced than the uncertainty says until forces
-        can no longer be computed [m]. Zero or negative if the uncertainty goes too far already."""
+        """Return by how much the pads' displacement could exceed that of an uncertainty before
+        forces can no longer be computed [m].
+
+        Zero or negative if the displacement of the uncertainty itself is already too large.
+
+        Args:
+            uncertainty: ranges of the uncertain quantities, pad displacements among them.
+        Compute how far each joint of the pressing arm turns per metre by which its pad moves into
+        the box, along the contact normal.
+        """
         off = uncertainty.pad_position + uncertainty.apart / 2.0
         return LARGEST_DISPLACEMENT * least_distance(self.workcell) - off
 

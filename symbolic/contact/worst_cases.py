@@ -233,11 +233,13 @@ def _program_and_inputs(
 
 
 def _inputs(kind: Any, given: Mapping[str, Expression]) -> dict[str, Expression]:
-    """Return symbols by name: pose, rate and second_rate (6,), the box pose and its time
-    derivatives; case (18,), a case of the uncertainty; then the parameters.
+    """Return the input symbols of a function of one case of the uncertainty.
+
+    They are, by name: pose (6,), the box pose [m, rad]; rate and second_rate (6,), its first and
+    second derivative by time; case (18,), laid out by `CASE_SIZES`; then the parameters.
 
     Args:
-        kind: type of the symbols, SX or MX.
+        kind: CasADi type of the symbols, SX or MX.
         given: symbolic parameters of the cell by group.
     """
     motion = {name: kind.sym(name, 6) for name in MOTION}

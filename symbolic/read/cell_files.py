@@ -314,7 +314,14 @@ class CellCollector:
         self._places: dict[str, str] = {}
 
     def collect(self, workcell: Workcell) -> None:
-        """Add every file that the workcell names.
+        """Add the content of every file that a workcell needs: robot descriptions with their
+        meshes, and meshes of the payload and of obstacles.
+
+        In the collected text of the workcell file, paths are replaced by those of the collected
+        files, and each robot states its URDF and its start branch.
+
+        Args:
+            workcell: the workcell as read from the file of this collector.
 
         Raises:
             BundleError: a file cannot be read, or the workcell's text cannot be changed.

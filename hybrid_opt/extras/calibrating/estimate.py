@@ -217,20 +217,20 @@ alone reaches 1.04."""
 def delay(
     time: Array, first: Array, second: Array, most: float = 1.0, apart: float | None = None
 ) -> float | None:
-    """Estimate by how much the second signal lags behind the first [s]; negative if it is ahead.
+    """Estimate the delay of one signal relative to another [s].
 
     Args:
         time: (n,) times of the samples [s].
-        first: (n,) the leading signal, in any unit.
-        second: (n,) the lagging signal, in any unit.
-        most: largest delay in either direction that is considered [s].
-        apart: largest magnitude of other delays that are compared with the result [s]; None to skip
-            this comparison.
+        first: (n,) the reference signal, in any unit.
+        second: (n,) the delayed signal, in any unit.
+        most: largest magnitude of the delay that is considered [s].
+        apart: delays up to this magnitude [s] have to correlate clearly less than the result; None
+            to skip this comparison.
 
     Returns:
-        The delay with the largest correlation of both signals' derivatives by time. None if the
-        signals are too short, if this correlation is weak, or if another delay up to `apart` has
-        nearly the same correlation.
+        Delay with the largest correlation of the signals' time derivatives; negative if `second` is
+        ahead of `first`. None if the signals are too short, if the correlation is weak, or if a
+        delay up to `apart` correlates nearly as well.
     """
     wide = round(SMOOTHED / GRID_STEP)
     if not 4 * wide < (time[-1] - time[0]) / GRID_STEP < LARGEST_GRID:

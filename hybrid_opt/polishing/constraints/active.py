@@ -165,10 +165,8 @@ class RowSelector:
         return values
 
     def persists(self, row: Row) -> bool:
-        """Return True if a tightened bound of a row (scalar inequality) stays valid at other
-        candidates.
-
-        If not, the bound is relative to the candidate at which it was measured.
+        """Return True if the tightened bound of a row (scalar inequality) remains valid when the
+        best candidate changes; False if it applies only to the candidate at which it was measured.
         """
         return self._kind_of(row).persists
 
@@ -211,11 +209,11 @@ class WorkingSet:
         return {*self._tightened, *self._active_for}
 
     def tighten(self, required: dict[Row, float], x: Array, radius: float) -> None:
-        """Raise the values that tightened rows (scalar inequalities) have to exceed in the next
-        step.
+        """Raise the values that rows (scalar inequalities) have to exceed in the next step towards
+        the tightened bounds that rejected steps gave them.
 
-        Each is raised by a share of the row's tightening: the trust region's radius over the
-        distance to the candidate at which the row was tightened, at most one.
+        Only a share of the difference between tightened bound and value is added: the radius of the
+        trust region over the distance to the candidate at which the bound was tightened, at most 1.
 
         Args:
             required: value that each row has to exceed, changed in place.

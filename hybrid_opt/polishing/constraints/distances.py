@@ -83,11 +83,12 @@ class DistanceConstraintKind(ConstraintKind[PathRow]):
     def required_values(
         self, carry: PlacedCarry, rows: Sequence[PathRow], is_relaxed: bool = False
     ) -> list[float]:
-        """Return the bound that each row (scalar inequality) has to exceed [m]: the wanted distance
-        minus the error of the smooth model.
+        """Return the bound [m] that the smooth model of the distance has to exceed in each row
+        (scalar inequality): the wanted distance minus the model's error.
 
-        The error is the measured least distance in the row's window minus the smooth model's value.
-        A row at a place that an arm does not reach gets the small value `PATCH_MARGIN`.
+        The error is the measured least distance minus the value of the smooth model at the row's
+        place. The distance is measured at this place and at up to `window` places on each side. A
+        row at a place that an arm does not reach gets the small value `PATCH_MARGIN`.
 
         Args:
             carry: the candidate, evaluated at places of the path.
@@ -126,8 +127,8 @@ class Clearances(DistanceConstraintKind):
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return rows (scalar inequalities) at the local minima of a pair's distance along the
-        path, if its lower bound is below `BODY_DISTANCE`.
+        """Return rows (scalar inequalities) for the pairs of bodies that come closer than
+        `BODY_DISTANCE`, at the local minima of a lower bound of their distance along the path.
 
         Args:
             carry: the candidate, evaluated at places of the path.
@@ -141,8 +142,8 @@ class Clearances(DistanceConstraintKind):
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
         """Return rows (scalar inequalities) for pairs of bodies that are too close.
 
-        They lie at the place of the least distance, at the next place, and at some distance before
-        and after.
+        Around each local minimum of a distance below its limit, rows lie at the minimum, at the
+        next place, and `BESIDE_CLEARANCE` before and after it along the path.
 
         Args:
             carry: candidate after the step.
@@ -194,11 +195,12 @@ class SeparatingAxisGaps(DistanceConstraintKind):
                 yield separation(pair, gaps, place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return rows (scalar inequalities) where the payload is too close to an obstacle box after
-        a step, and at some distance before and after.
+        """Return rows (scalar inequalities) where the payload comes too close to an obstacle box
+        after a step: at the place of the least distance, and half of `KINK_WINDOW` before and after
+        it along the path.
 
-        Each row has the direction of the largest gap before the step. Places near a kink, where
-        this direction changes, are left to `AxisSwitchGaps`.
+        Each row limits the gap along the direction in which the gap was largest before the step.
+        Places near a kink, where this direction changes, are left to `AxisSwitchGaps`.
 
         Args:
             carry: candidate after the step.
@@ -222,8 +224,9 @@ class AxisSwitchGaps(DistanceConstraintKind):
         self.window = cell.grid.places(KINK_WINDOW)
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
-        """Return a row (scalar inequality) for each kink, a place at which the payload passes an
-        edge of a box, whose gap is below `KINK_DISTANCE`.
+        """Return a row (scalar inequality) for each kink whose gap is below `KINK_DISTANCE`.
+
+        A kink is a place of the path at which the payload passes an edge of an obstacle box.
 
         Args:
             carry: the candidate, evaluated at places of the path.
@@ -234,10 +237,11 @@ class AxisSwitchGaps(DistanceConstraintKind):
                 yield passing(pair, gaps, kink, place)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return a row (scalar inequality) for each kink, at which the payload passes an edge of a
-        box, near a place where the payload is too close after a step.
+        """Return a row (scalar inequality) for each kink that lies near a place of the path where
+        the payload comes too close to an obstacle box after a step.
 
-        The kinks are those of the candidate before the step.
+        A kink is a place at which the payload passes an edge of the obstacle. The kinks of the
+        candidate before the step are used.
 
         Args:
             carry: candidate after the step.
@@ -270,16 +274,19 @@ class Gaps:
 
 
 def edges(gaps: Gaps, limit: float) -> list[tuple[int, int]]:
-    """Find the kinks: between two places the direction of the largest gap changes, and the gap from
-    falling to rising.
+    """Find the kinks of the largest gap along a path.
+
+    A kink lies between two successive places at which different directions have the largest gap.
+    The gap along the first of these directions falls from place to place, that along the second one
+    rises.
 
     Args:
-        gaps: gaps of one pair along the path.
-        limit: largest gap [m] above which kinks are left out.
+        gaps: gaps between payload and one obstacle box along the path.
+        limit: kinks are left out if the largest gap reaches this limit [m] at both places.
 
     Returns:
-        For each kink the index of the place before it, and the index of the neighbouring place with
-        the smaller value of the largest gap.
+        For each kink the index of the place before it, and the index of that one of the two places
+        with the smaller value of the largest gap.
     """
     best, height, along = gaps.best, gaps.height, gaps.along
     return [
@@ -292,14 +299,14 @@ def edges(gaps: Gaps, limit: float) -> list[tuple[int, int]]:
 
 
 def passing(pair: int, gaps: Gaps, kink: int, place: int) -> PathRow:
-    """Return the row (scalar inequality) for a kink, at which the payload passes an edge of an
-    obstacle box.
+    """Return the row (scalar inequality) for a kink: the payload passes an edge of an obstacle box,
+    and the direction of the largest gap changes.
 
     Args:
         pair: index of the pair of payload and obstacle.
         gaps: gaps of the pair along the path.
         kink: index of the place before the kink.
-        place: index of the place of the row.
+        place: index of the place at which the row applies.
     """
     before, after = (int(gaps.best[k]) for k in (kink, kink + 1))
     return PathRow(AxisSwitchGap(pair, before, after), place)
@@ -336,17 +343,18 @@ def near_gaps(kind: DistanceConstraintKind, carry: PlacedCarry) -> Iterable[tupl
 def violated_passages(
     kind: DistanceConstraintKind, carry: PlacedCarry, known: PlacedCarry
 ) -> Iterable[tuple[int, Gaps, int, list[tuple[int, int]]]]:
-    """Yield the places at which a separable pair, payload and a box-shaped obstacle, is too close
-    after a step.
+    """Find the places at which the payload comes too close to a box-shaped obstacle after a step.
 
     Args:
-        kind: kind of constraint, which knows the separable pairs and their least distances.
+        kind: kind of constraint, which knows the pairs of payload and obstacle box and their least
+            distances.
         carry: candidate after the step.
         known: candidate before the step.
 
     Yields:
-        Index of the pair; its gaps before the step; index of the place; and the kinks before the
-        step that lie near the place, as `edges` returns them.
+        Index of the pair; its gaps before the step; index of a place with a local minimum of the
+        distance below its limit; and the kinks (index of the place before the kink, index of the
+        place with the smaller gap) that lie near this place, before the step.
     """
     window = kind.grid.places(KINK_WINDOW)
     for pair, distance in carry.distances.closer_than(kind.least).items():

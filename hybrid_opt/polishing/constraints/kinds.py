@@ -170,10 +170,11 @@ class Forces(ConstraintKind[ForceRow]):
         yield from self._other_branches(carry)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[ForceRow]:
-        """Return rows (scalar inequalities) for branches (linear functions whose maximum is the
-        normal force) other than the one with rows along the whole path.
+        """Return rows (scalar inequalities) for the branches that determine a normal force, or
+        nearly do, and have no rows along the whole path.
 
-        They lie at samples where such a branch is the largest, or nearly so.
+        A normal force is the maximum of several linear functions, its branches. Only the branch
+        with tight friction cones has rows along the whole path.
 
         Args:
             carry: candidate after the step.
@@ -199,10 +200,11 @@ class Forces(ConstraintKind[ForceRow]):
         }
 
     def _values(self, carry: PlacedCarry) -> Array:
-        """Compute the branches of the normal forces: linear functions whose maximum is the force.
+        """Evaluate the branches of the normal forces: the linear functions whose maximum is the
+        force.
 
         Args:
-            carry: the carry.
+            carry: the candidate, evaluated at places of the path.
 
         Returns:
             (samples, 2, branches) values for both robots [N].
@@ -210,8 +212,8 @@ class Forces(ConstraintKind[ForceRow]):
         return np.asarray(np.einsum("rbk,nk->nrb", self.cell.coefficients, carry.split))
 
     def _peaks(self, carry: PlacedCarry) -> set[int]:
-        """Return the indices of samples at local maxima of either robot's normal force, and of both
-        neighbours.
+        """Return the indices of the samples at which a robot's normal force has a high local
+        maximum, and of the samples before and after each of them.
         """
         has_branches = self.cell.robust is None and self._main == CONE_TIGHT
         force = self._values(carry).max(axis=2) if has_branches else carry.force
@@ -222,18 +224,17 @@ class Forces(ConstraintKind[ForceRow]):
         return {int(k) for k in (tops[:, None] + np.array([-1, 0, 1])).ravel()}
 
     def _other_branches(self, carry: PlacedCarry) -> list[ForceRow]:
-        """List the branches that come near to a normal force besides the branch with tight friction
-        cones.
+        """Return rows (scalar inequalities) for the branches that determine a normal force, or
+        nearly do, except the branch with tight friction cones.
 
-        A branch is one of the linear functions whose maximum is the normal force. Robust forces
-        have no branches, and forces that a convex program computes have none either; the list is
-        empty for these.
+        A normal force is the maximum of several linear functions, its branches. Robust forces and
+        forces that a convex program computes have no branches; for them the list is empty.
 
         Args:
-            carry: the carry.
+            carry: the candidate, evaluated at places of the path.
 
         Returns:
-            One row (scalar inequality) for each such branch, robot and sample.
+            One row for each such branch, robot and sample.
         """
         if self.cell.robust is not None or self._main == PROGRAM_BRANCH:
             return []
@@ -412,14 +413,15 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
     ) -> list[float]:
         """Return the new bound of each row (scalar inequality) that a step violated.
 
-        The bound is `SAMPLING_MARGIN` if both arms reach all places after the step. Otherwise it is
-        the mean of the row's last bound and its value at the candidate before the step.
+        If both arms reach all places after the step, the bound is `SAMPLING_MARGIN`. Otherwise it
+        is the mean of two values: the row's bound in the last program, and the value of its left
+        side at the candidate before the step.
 
         Args:
             carry: candidate after the step.
             known: candidate before the step.
             rows: the violated rows.
-            before: last bound of each row.
+            before: bound of each row in the last program.
         """
         if not carry.unreachable_arms:
             return self.required_values(carry, rows)

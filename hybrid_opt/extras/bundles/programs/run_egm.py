@@ -295,14 +295,14 @@ class Stream:
         return to_robot(number, now, joints, further)
 
     def _inward(self, s: float) -> list[float]:
-        """Compute for each joint of the pressing arm its motion per motion of the pad along the
-        normal, into the box.
+        """Compute how far each joint of the pressing arm turns per metre by which its pad moves
+        into the box, along the contact normal.
 
         Args:
-            s: planned time [s] on the path at which this is computed.
+            s: planned time [s] since the beginning of the job.
 
         Returns:
-            One value for each joint [rad/m], interpolated between the samples of the job.
+            One value for each joint [rad/m], interpolated linearly between the samples of the job.
         """
         rows, time = self.config["inward"], self.job.time
         k = min(max(bisect_left(time, s) - 1, 0), len(rows) - 2)
