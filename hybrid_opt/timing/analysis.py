@@ -105,8 +105,8 @@ def check_search_timing(model: TimingModel, x: Array) -> Timing:
 
 
 def _jump(model: TimingModel, carry: Carry) -> Place | None:
-    """Find the joint whose speed jumps most at the start or end of a carry, relative to its speed
-    limit.
+    """Find the joint with the largest speed at the start or the end of a carry, relative to its
+    speed limit. There its speed would have to jump.
 
     Args:
         model: timing model of the workcell.
@@ -152,9 +152,8 @@ def drivable_timing(model: TimingModel, x: Array) -> Timing:
 
 
 def closest_to_reference_timing(model: TimingModel, x: Array) -> Timing:
-    """Compute the fastest timing from rest to rest that never exceeds the task's reference speeds.
-
-    The box moves at a reference speed wherever the other limits allow this.
+    """Compute the fastest timing from rest to rest in which the box never exceeds the task's
+    reference speeds, linear and angular.
 
     Args:
         model: timing model of the workcell.

@@ -118,9 +118,15 @@ def time_with_jerk(
 
 
 def applicable_jerk_limits(workcell: Workcell, limits: TimingLimits) -> JerkLimits | None:
-    """Return the workcell's jerk limits if a timing within further `limits` can respect them. None
-    if the workcell has no jerk limits, or if `limits` bound robust forces whose derivatives the
-    contact model does not give.
+    """Return the jerk limits with which a path can be timed within given further limits.
+
+    Args:
+        workcell: the cell, which states the jerk limits.
+        limits: the further limits.
+
+    Returns:
+        The workcell's jerk limits; None if it states none, or if `limits` bound robust forces and
+        the contact model has no derivatives of these.
     """
     slopes = command_model(workcell).has_scalar_squeeze or not limits.robust
     return JerkLimits.from_workcell(workcell) if slopes else None
@@ -142,11 +148,11 @@ class _JerkProblem:
         )
 
     def solve(self) -> JerkTiming:
-        """Solve quadratic programs until the duration settles, then check the result between the
-        coarse points.
+        """Solve quadratic programs, whose limits apply at coarse points of the path, until the
+        duration settles. Then check the result at finer points.
 
-        Where the result exceeds a limit there, the limits of the neighbouring coarse points are
-        tightened and the programs solved again, a few times at most.
+        Where a finer point exceeds a limit, the limits of the neighbouring coarse points are
+        tightened and the programs solved again, at most `MAX_TIGHTENINGS` times.
         """
         c = np.ones(self._coarse.value.shape[1])
         c, rounds = self._iterate(self._start_factor(c) * c)
@@ -253,8 +259,11 @@ class _JerkProblem:
             rows.add_norm_bounds(box, np.zeros((len(v), 3)), head, level, at.first_basis)
 
     def _excess(self, c: Array) -> Array:
-        """Compute the largest use (n,) of any limit at the finer points beside each of n coarse
-        points, for spline coefficients c (k,) of the squared speed.
+        """Compute for each of n coarse points the largest ratio (n,) of value to limit at the finer
+        points around it, over all limits.
+
+        Args:
+            c: (k,) spline coefficients of the squared speed.
         """
         carry = self._model.carry(self._fine.motion, *self._fine.profile(c))
         ratios = self._model.carry_limits.ratios(carry, self._limits)
@@ -265,7 +274,10 @@ class _JerkProblem:
         return np.asarray(np.maximum(np.append(use[0], between), np.append(between, use[-1])))
 
     def _start_factor(self, c: Array) -> float:
-        """Return a factor on spline coefficients c (k,) that makes the motion very slow."""
+        """Return a factor on spline coefficients c (k,) of the squared speed that makes the motion
+        slow: no limit is used more than halfway between the largest use at rest and the whole
+        limit.
+        """
         factor = 1.0
         rest = max(self._check(self._coarse, 0.0 * c)[1:])
         allowed = rest + START_UTILISATION * (1.0 - rest)
@@ -291,8 +303,11 @@ class _JerkProblem:
         return timing, most_used(timing.use).ratio, joint, box
 
     def _use_by_factor(self, c: Array) -> Callable[[float], float]:
-        """Return the function from a factor on all speeds to the largest use of any limit on the
-        finer grid, for spline coefficients c (k,) of the squared speed.
+        """Return a function that tells how far a slowed motion uses its limits: from a factor on
+        all speeds to the largest ratio of value to limit at the finer points.
+
+        Args:
+            c: (k,) spline coefficients of the squared speed of the motion that is slowed.
         """
         jerk = max(float(jerk.max()) for jerk in self._jerks(self._fine, c))
 
@@ -393,14 +408,23 @@ class WarpedPath:
         return self.columns[:, 0]
 
     def local(self, values: Array) -> Array:
-        """Select from values (n, ..., k) of all coefficients the entries (n, ..., SPLINE_SUPPORT)
-        of those that influence each sample."""
+        """Select, for each of n samples, the entries that belong to the `SPLINE_SUPPORT`
+        coefficients that influence it.
+
+        Args:
+            values: (n, ..., k) one entry per sample and coefficient.
+
+        Returns:
+            (n, ..., SPLINE_SUPPORT) the selected entries.
+        """
         shape = (len(self.columns), *[1] * (values.ndim - 2), SPLINE_SUPPORT)
         return np.take_along_axis(values, self.columns.reshape(shape), axis=-1)
 
     def duration(self, c: Array) -> float:
-        """Compute the duration [s] with spline coefficients c (k,) of the squared speed by
-        Simpson's rule, for an odd number of samples.
+        """Compute the duration [s] by Simpson's rule; the number of samples has to be odd.
+
+        Args:
+            c: (k,) spline coefficients of the squared speed.
         """
         return float(self._weights() @ (1.0 / np.sqrt(np.maximum(self.value @ c, 1e-300))))
 
@@ -424,8 +448,12 @@ class WarpedPath:
         return time, np.sqrt(np.maximum(self.squared_by @ c, 0.0)), self.acceleration_by @ c
 
     def jerk(self, c: Array) -> tuple[Array, Array]:
-        """Compute the jerks of the joints (n, joints) [rad/s^3] and of the box frame (n, 3) [m/s^3]
-        with coefficients c (k,)."""
+        """Compute the jerks of the joints (n, joints) [rad/s^3] and of the box frame's origin (n,
+        3) [m/s^3], world frame.
+
+        Args:
+            c: (k,) spline coefficients of the squared speed.
+        """
         root = np.sqrt(np.maximum(self.value @ c, 0.0))[:, None]
         own = c[self.columns][:, None]
         return root * (self.joint_jerk_by * own).sum(-1), root * (self.box_jerk_by * own).sum(-1)
@@ -468,11 +496,13 @@ class JerkProgram:
     def add_two_sided_bounds(
         self, A: Array, head: Array | float, bound: Array, first: NDArray[np.intp]
     ) -> None:
-        """Add linear rows -r <= A c <= r with r = bound - head . c, m rows at each of n points.
+        """Add the linear rows |A c| <= bound - head . c, m rows with a common right side at each of
+        n points.
 
         Args:
             A: (n, m, width) successive nonzero entries of each row.
-            head: (n, 1, width) entries of the vector `head` there; 0 for a constant r.
+            head: (n, 1, width) entries of the vector `head` at each point, for the same
+                coefficients; 0 for a constant right side.
             bound: (n,) bounds.
             first: (n,) index of the coefficient of the first entry at each point.
         """
@@ -484,12 +514,12 @@ class JerkProgram:
     def add_norm_bounds(
         self, A: Array, b: Array, head: Array, bound: Array, first: NDArray[np.intp]
     ) -> None:
-        """Add n cones that bound the length of A c + b by bound - head . c.
+        """Add n second-order cones |A c + b| <= bound - head . c.
 
         Args:
             A: (n, 3, width) successive nonzero entries of each cone's three rows.
             b: (n, 3) constant parts.
-            head: (n, width) entries of the vector `head` there.
+            head: (n, width) entries of the vector `head` of each cone, for the same coefficients.
             bound: (n,) bounds.
             first: (n,) index of the coefficient of each cone's first entry.
         """
@@ -507,7 +537,9 @@ class JerkProgram:
 
     @cached_property
     def rows(self) -> tuple[sparse.csr_array, Array, sparse.csr_array, Array]:
-        """Matrix A and right side b of all linear rows, then of all cones (four rows each)."""
+        """Matrix A and right side b of all linear rows A c <= b; then matrix and constant part of
+        all cones, four rows each: the bound, and the three components of the vector.
+        """
         from scipy import sparse
 
         A, b = zip(*self._linear, strict=True)
@@ -516,8 +548,14 @@ class JerkProgram:
         return stacked, np.concatenate(b), cones, np.concatenate(cone_b)
 
     def used(self, c: Array, share: float) -> tuple[Mask, Mask]:
-        """Mark the linear rows (n_linear,) and the cones (n_cones,) of which coefficients c (k,)
-        use more than `share` of the bound.
+        """Find the linear rows and the cones whose left side exceeds a share of the right side.
+
+        Args:
+            c: (k,) coefficients.
+            share: the share; 1 finds the violated rows and cones.
+
+        Returns:
+            Masks of the linear rows (n_linear,) and of the cones (n_cones,), True for those found.
         """
         A, b, cone_A, cone_b = self.rows
         inside = cone_b - (cone_A @ c).reshape(-1, 4)

@@ -52,11 +52,11 @@ class PathLimits:
         return first / bound, second / bound
 
     def accelerations(self) -> list[tuple[Array, Array, float]]:
-        """Return the limits on the payload's acceleration, linear and angular.
+        """Return the limits on the payload's linear and angular acceleration.
 
         Returns:
-            For each limit the derivatives (n, 3) of the acceleration by u'' and by u'^2, and the
-            largest allowed length of the acceleration [m/s^2 or rad/s^2].
+            For each limit two vectors (n, 3), first and second, and the largest allowed length
+            [m/s^2 or rad/s^2] of the acceleration first u'' + second u'^2.
         """
         return [
             (first[:, :3], second[:, :3], float(self._bounds[limit.name]))
@@ -69,16 +69,17 @@ class PathLimits:
         return getattr(m, f"{name}_first"), getattr(m, f"{name}_second")
 
     def forces(self, a: Array, w: Array) -> list[tuple[Array, Array]]:
-        """Compute the normal forces that are convex in (u'', u'^2), over the force limit.
+        """Compute the normal forces over the force limit, as far as they are convex functions of
+        (u'', u'^2).
 
         Args:
             a: (n,) path accelerations u'' [1/s^2].
             w: (n,) squared path speeds u'^2 [1/s^2].
 
         Returns:
-            For planned forces, and for robust forces if these are limited: values (n, 2) of both
-            robots, and their derivatives (n, 2, 2) by (u'', u'^2). An empty list without force
-            limit.
+            One pair for planned forces, and one for robust forces if these are limited: values (n,
+            2) of both robots, and their derivatives (n, 2, 2) by (u'', u'^2). An empty list without
+            force limit.
         """
         model, limit = self._model, self._limits.force
         if limit is None:

@@ -119,8 +119,8 @@ class PathMotion:
 
     @cached_property
     def _spline(self) -> tuple[CubicSpline, Array]:
-        """Cubic spline in the path parameter u through all arrays of the motion, their columns side
-        by side. The second item holds the index of the first column of each array except the first.
+        """Cubic spline in the path parameter u through all arrays of the motion, flattened and
+        joined column by column; and the columns at which they are to be split again.
         """
         u = self.parameter[::_SPLINE_EVERY]
         columns = [
@@ -207,8 +207,10 @@ class CarryLimits:
         return ratios
 
     def limited_force(self, carry: Carry, limits: TimingLimits) -> Array:
-        """Return the normal forces (n, 2) [N] of a carry to which the force limit applies: planned
-        forces, or if `limits` bound robust forces the larger ones of planned and robust forces.
+        """Return the normal forces (n, 2) [N] of a carry that the force limit bounds.
+
+        They are the planned forces. If `limits` bound robust forces, they are the larger one of
+        planned and robust force at each sample and robot.
         """
         if not limits.robust:
             return carry.normal_force
@@ -217,9 +219,9 @@ class CarryLimits:
         return np.maximum(carry.normal_force, np.stack([leading, commanded], axis=1))
 
     def _near_limit(self, carry: Carry, limits: TimingLimits) -> Array:
-        """Compute `limited_force` (n, 2) [N] of a carry, exact only near the limit and near the
-        largest force. Elsewhere planned forces replace robust ones, which takes a fraction of the
-        time."""
+        """Compute `limited_force` (n, 2) [N] in less time, exactly only where it is near the force
+        limit or near its largest value. Elsewhere the result is the planned force.
+        """
         if not limits.robust or limits.force is None:
             return self.limited_force(carry, limits)
         if not command_model(self.workcell).has_scalar_squeeze:
@@ -246,9 +248,15 @@ def _bound_of(limit: Limit, workcell: Workcell) -> Array:
 def _robust_forces_above(
     level: float, points: PathPoints, path: RobustPath, found: Array, every: int = 1
 ) -> bool:
-    """Raise entries of `found` (n, 2) [N], in place, to the robust forces of `path` at n points
-    where these exceed a level [N]. Only every point with an index divisible by `every` is
-    evaluated.
+    """Compute the robust forces that exceed a level, and enter them into an array of forces.
+
+    Args:
+        level: the level [N].
+        points: n points of paths.
+        path: computes robust forces at the points.
+        found: (n, 2) normal forces of both robots [N]; entries are raised in place to robust forces
+            above the level.
+        every: only points whose index is a multiple of this number are evaluated.
 
     Returns:
         True if any robust force exceeds the level.
@@ -344,9 +352,12 @@ class TimingModel:
         return self._latest
 
     def path_coefficients(self, motion: PathMotion) -> dict[str, Array]:
-        """Return the coefficients of the limits of one path, and the box poses with redundant
-        joints and their two derivatives by u, at both ends and in the middle of every interval. It
-        is the argument `paths` of `ForwardBackwardPasses.time` for one path.
+        """Return the arrays of one path that `ForwardBackwardPasses.time` takes as `paths`.
+
+        Returns:
+            `limits`, the coefficients of the limits; `pose`, `pose_first` and `pose_second`, box
+            poses with redundant joints and their first and second derivative by u. Each array has
+            shape (1, 2 intervals + 1, columns), for both ends and the middle of every interval.
         """
         task, some = self.workcell.task, slice(None, None, REFINEMENT // 2)
         box = (motion.pose, motion.pose_first, motion.pose_second)
@@ -397,11 +408,12 @@ class TimingModel:
         )
 
     def arm_motion(self, arm: int, q: Array, pose: Array, first: Array) -> dict[str, Array]:
-        """Compute the outputs `symbolic.path_motion.ARM_OUTPUTS` of one arm (path derivatives of
-        the joints and parts of the torques, by name) while the box moves straight.
+        """Compute the motion of one arm while the box moves straight: the outputs
+        `symbolic.path_motion.ARM_OUTPUTS` (derivatives of the joint positions by the path
+        parameter, and parts of the joint torques), by name.
 
         Args:
-            arm: 0 or 1.
+            arm: index of the arm, 0 or 1.
             q: (n, joints) joint positions that hold the box at the poses [rad]; redundant joints
                 rest.
             pose: (n, 6) box poses [m, rad].
@@ -479,7 +491,9 @@ class TimingModel:
         )
 
     def still(self, motion: PathMotion) -> Carry:
-        """Return a carry that stands still at every sample of `motion`."""
+        """Return a carry whose samples are those of `motion`, each with the arms and the box at
+        rest.
+        """
         zero = np.zeros(len(motion.parameter))
         return self.carry(motion, zero, zero, zero)
 
@@ -549,8 +563,13 @@ class SpeedProfile:
     def carry(
         self, model: TimingModel, motion: PathMotion, a: float = 0.0, w: float = 0.0
     ) -> Carry:
-        """Return the carry that drives the path `motion` at these speeds. The numbers `a` and `w`
-        [1/s^2] are added to every path acceleration u'' and to every squared path speed u'^2.
+        """Return the carry that drives a path with these speeds.
+
+        Args:
+            model: timing model of the workcell.
+            motion: geometry of the path.
+            a, w: numbers [1/s^2] that are added to the path acceleration u'' and to the squared
+                path speed u'^2 at every sample, for finite differences.
         """
         speed = np.sqrt(np.maximum(self.w + w, 0.0))
         return model.carry(motion.at(self.index), self.time, speed, self.a + a)
@@ -558,8 +577,12 @@ class SpeedProfile:
 
 def sample_limits_set(compiled: CompiledCell, lanes: int) -> NumericFunction:
     """Load or build the compiled function `symbolic.limit_coefficients.sample_limits_function` of a
-    cell, for `lanes` samples that one vector instruction evaluates side by side; 0 for the
-    machine's width.
+    cell.
+
+    Args:
+        compiled: the cell with its compiled functions.
+        lanes: number of samples that one vector instruction evaluates side by side; 0 for the
+            machine's width.
     """
 
     def make(model: CellModel) -> dict[str, ca.Function]:

@@ -249,12 +249,13 @@ class RobustCuttingPlanes:
         return found
 
     def _cut(self, chosen: NDArray[np.intp], squared: Array) -> NDArray[np.bool_]:
-        """Add supporting lines (tangents that bound the robust forces) where timings exceed the
-        force limits of their paths.
+        """Bound robust forces by further supporting lines (tangents) where timings exceed the force
+        limits of their paths.
 
         Args:
-            chosen: (m,) indices of paths.
-            squared: (m, intervals + 1) squared path speeds of their timings [1/s^2].
+            chosen: (m,) indices of the paths that were timed.
+            squared: (m, intervals + 1) squared path speeds u'^2 of these timings at the grid points
+                [1/s^2].
 
         Returns:
             (m,) True for paths whose robust forces exceed their limit.
@@ -291,8 +292,8 @@ class RobustCuttingPlanes:
         force: Array,
         slope: Array,
     ) -> None:
-        """Add a supporting line at each of m points: the tangent of the larger force of both
-        robots.
+        """Store a supporting line at each of m points: the tangent of the larger one of both
+        robots' forces, as a function of (u'', u'^2).
 
         Args:
             place: index of the path and of the sample of each point, (m,) each.
@@ -475,12 +476,14 @@ def failed_timing(status: TimingStatus, place: Place, intervals: int) -> PathTim
 def path_failure(
     workcell: Workcell, pose: Array, lost: Array, limit_margin: Array, manipulability: Array
 ) -> tuple[TimingStatus, Place, str] | None:
-    """Find the error of a path on which nothing moves or an arm fails.
+    """Find out why a path has no timing at any speed: nothing moves, or an arm does not reach a
+    pose, leaves its joint range or is near a singularity.
 
     Args:
         workcell: the workcell.
         pose: (n, 6) box poses at uniform samples of the path parameter.
-        lost: (n, 2) by sample and arm, 0 while the arm has reached all samples up to here, else 1.
+        lost: (n, 2) by sample and arm, 0 while the arm has reached all samples up to this one, else
+            1.
         limit_margin: (n, 2) least distance of a joint to its limits [rad], negative beyond them.
         manipulability: (n, 2) absolute determinant of the Jacobian [m^3].
 

@@ -300,7 +300,8 @@ class CandidateDriver:
 
         Args:
             candidate: compiled `symbolic.functions.candidate_function`.
-            x: (n, n_var) decision vectors. A path without a timing stands still for one second.
+            x: (n, n_var) decision vectors. A candidate without a timing is evaluated at rest for
+                one second.
 
         Returns:
             Outputs of `candidate` by name, and `peak_force` (n, 2), the largest normal forces [N];

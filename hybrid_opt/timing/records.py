@@ -168,12 +168,12 @@ class Timing(Displayable):
 
     @property
     def ok(self) -> bool:
-        """Return True if the timing respects every limit."""
+        """True if the timing respects every limit."""
         return self.status is TimingStatus.OK
 
     @property
     def driven(self) -> Carry:
-        """Return the carry under this timing, which has to exist."""
+        """The carry under this timing; only for a timing that has one."""
         assert self.carry is not None, self.reason
         return self.carry
 
@@ -286,7 +286,7 @@ class PathTiming:
 
     @property
     def ok(self) -> bool:
-        """Return True if the timing respects every limit."""
+        """True if the timing respects every limit."""
         return self.status is TimingStatus.OK
 
     @property

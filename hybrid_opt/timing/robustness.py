@@ -107,16 +107,15 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
 
     Motion and timing stay the same. For each changed value the forces are computed anew, so the
     robots press as hard as necessary. The carry fails if a normal force exceeds its reference
-    force, a centre of pressure leaves its patch, or a joint torque exceeds its maximum. For elastic
-    pads the result has no patch size. It states how far the centre of pressure may shift until the
-    pad's rim lifts off.
+    force, a centre of pressure leaves its patch, or a joint torque exceeds its maximum.
 
     Args:
         model: timing model of the workcell.
         carry: the carry.
 
     Returns:
-        One margin for each changed quantity.
+        One margin for each changed quantity. Elastic pads have no margin of the patch size; theirs
+        states how far the centre of pressure may shift until the pad's rim lifts off.
     """
     workcell = model.workcell
     payload, contacts, task = workcell.payload, workcell.contacts, workcell.task
@@ -149,11 +148,12 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
         return "" if use[name] <= 1.0 else name
 
     def lowered(whose: str, which: Array) -> Margin:
-        """Return how far the friction coefficients of some contacts may fall, by one common share.
+        """Return the margin of the friction coefficients of some contacts, all multiplied by one
+        factor below 1.
 
         Args:
             whose: name of these contacts, for the margin.
-            which: (2,) 1 for these contacts, else 0.
+            which: (2,) 1 for these contacts, 0 for the other one.
         """
         nominal = float(friction[which > 0.0].min())
         lost, fails = _largest_feasible_change(
@@ -194,11 +194,10 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
 
 
 def _even_margins(model: TimingModel, carry: Carry) -> list[Margin]:
-    """Compute for each elastic pad how far its centre of pressure may shift further until the pad's
-    rim lifts off [m].
+    """Compute for each elastic pad the largest shift of its centre of pressure without lift-off of
+    the pad's rim, and how much of it the carry leaves unused [m].
 
-    The shift starts from the largest one of the carry. Contact models without elastic pads give an
-    empty list.
+    Contact models without elastic pads give an empty list.
 
     Args:
         model: timing model of the workcell.
@@ -323,15 +322,17 @@ class TimingSensitivity:
             )
 
     def changes(self, low: dict[str, Array], high: dict[str, Array]) -> tuple[float, float]:
-        """Compute how the shortest duration changes with a number of the workcell file.
+        """Compute how the shortest duration changes with a number of the workcell file, to first
+        order.
 
         Args:
-            low: result of `CarryLimits.ratios` at `speeds`, with the number lowered.
-            high: the same result with the number raised by the same amount.
+            low: result of `CarryLimits.ratios` for the motion `speeds` of the path, with the number
+                lowered.
+            high: result for the same motion with the number raised by the same amount.
 
         Returns:
             Change of the duration [s] with the number raised, and with it lowered; NaN if no timing
-            nearby satisfies the limits.
+            near the fastest one satisfies the changed limits.
         """
         more = (self._select_used(high) - self._select_used(low)) / 2.0
         largest = float(np.abs(more).max(initial=0.0))

@@ -156,7 +156,7 @@ def _slow_down(
         model: timing model of the workcell.
         motion: geometry of the path.
         limits: limits in addition to the workcell's.
-        found: the timing to check, by either method.
+        found: the timing to check, by the backward and forward pass or by TOPP-RA.
     """
 
     @cache
@@ -213,7 +213,7 @@ def check_limits(
         ratios: result of `CarryLimits.ratios`; computed if None.
 
     Returns:
-        Timing with the carry and the utilisations. Its status is always `OK`, even if a limit is
+        Record of the carry with these ratios. Its status is always `OK`, even if a limit is
         exceeded.
     """
     ratios = model.carry_limits.ratios(carry, limits) if ratios is None else ratios

@@ -159,10 +159,8 @@ class _CuttingPlaneProblem:
         )
 
     def _interval_rows(self, rows: list[LinearLimits]) -> LinearLimits:
-        """Convert limits at the points of each interval to limits of the interval, in the scaled
-        path coordinate.
-
-        A limit of an interval bounds its constant u'' and the u'^2 at its beginning.
+        """Convert limits at the points of each interval to limits on the interval's two unknowns:
+        its constant u'', and u'^2 at its beginning. Both are taken in the scaled path coordinate.
 
         Args:
             rows: limits at all points.
@@ -195,17 +193,17 @@ class _CuttingPlaneProblem:
         return a / self._scale, w.reshape(-1) / self._scale**2
 
     def _advance(self, squared: Array) -> bool:
-        """Add rows to the next linear program, after a timing by the last one.
+        """Add rows to the next linear program that the timing by the last one violates.
 
-        Supporting lines cut off a timing that exceeds convex limits. The other limits are
-        linearised about the timing.
+        Convex limits that the timing exceeds get supporting lines, which exclude the timing. The
+        other limits are linearised about it.
 
         Args:
             squared: (intervals + 1,) squared speeds of the timing in the scaled path coordinate.
 
         Returns:
-            True if the timing satisfies the limits and, where limits are linearised, its duration
-            no longer changes.
+            True if no further program is necessary: the timing satisfies the limits and, where
+            limits are linearised, its duration no longer changes.
         """
         a, w = self._at_points(squared)
         excess = self._cut(a, w)
@@ -295,14 +293,14 @@ class _CuttingPlaneProblem:
 
 
 def norm_rows(first: Array, second: Array, limit: float, directions: Array) -> LinearLimits:
-    """Return supporting lines (tangents) of a limit on the length of the vector first u'' + second
-    u'^2.
+    """Return supporting lines (tangents) of the limit |first u'' + second u'^2| <= limit on the
+    length of a vector.
 
     Args:
         first: (n, 3) derivative of the vector by u'' at n points.
         second: (n, 3) derivative of the vector by u'^2.
-        limit: largest allowed length.
-        directions: (n, k, 3) unit vectors; each gives one line.
+        limit: largest allowed length, in the vector's unit.
+        directions: (n, k, 3) unit vectors; each gives one line, a bound on the component along it.
     """
     alpha = np.einsum("nkd,nd->nk", directions, first) / limit
     beta = np.einsum("nkd,nd->nk", directions, second) / limit
@@ -325,9 +323,9 @@ def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> 
     """Linearise about z k functions of (u'', u'^2) that may not exceed one, such that rest stays
     feasible.
 
-    A tangent that forbids rest (u'' = u'^2 = 0) is changed: its slope by u'^2 becomes that of the
-    line from z to rest, and its slope by u'' stays. A larger bound instead would not even exclude
-    z.
+    A tangent that forbids rest (u'' = u'^2 = 0) is replaced by the affine function that has the
+    values of the function at z and at rest, and the tangent's slope by u''. A larger bound of the
+    tangent would not exclude z, although z exceeds the limit.
 
     Args:
         value: (n, k) values of the functions at z.
