@@ -123,15 +123,16 @@ def position_control(job: Job, stiffness: float) -> PositionControl:
 
 
 def force_margin(job: Job) -> float:
-    """Compute the least excess of a commanded normal force over the planned force that holds the
-    box [N], over both robots and all phases in which the box is held.
+    """Compute the least difference between commanded and planned normal force [N], over both robots
+    and all phases in which the box is held. The planned force is the least one that holds the box
+    if everything is exactly as described.
     """
     return min(float((p.force.normal - p.force.least).min()) for p in job.held)
 
 
 def skewed(job: Job, delay: float, stiffness: float) -> Skew:
-    """Compute the effect on the contact forces if one arm is late while the box is held, for the
-    arm whose delay has the worse effect.
+    """Compute how the contact forces change if one arm is late while the box is held. Either arm is
+    taken as the late one, and the worse result is returned.
 
     The arms act as quasi-static springs. A relative displacement of the pads along the contact
     normal changes the squeeze. A displacement across the normal adds a tangential force that
@@ -233,14 +234,14 @@ def _displacement(job: Job, phase: Phase, late: int, delay: float) -> tuple[Arra
 
     Args:
         job: the whole job.
-        phase: phase of the job in which the box is held.
+        phase: phase of the job in which the box is held, at m samples.
         late: index of the late arm.
         delay: time by which the arm is late [s].
 
     Returns:
-        - Mask (m,) of the m samples of the phase, False where a time is repeated.
-        - Displacement (n, 3) [m] of the late pad at the n samples with True, world frame.
-        - Contact normal (n, 3) at these samples, world frame.
+        - Mask (m,), False for samples that repeat the time of the sample before; n samples remain.
+        - Displacement (n, 3) [m] of the late pad at the remaining samples, world frame.
+        - Contact normal (n, 3) of the late pad at these samples, world frame.
     """
     motion, contact = phase.motion, job.workcell.contacts[late]
     keep = np.concatenate([[True], np.diff(motion.time) > 0.0])

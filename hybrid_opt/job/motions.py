@@ -207,8 +207,8 @@ def follow_line(
     """
 
     def share(way: Array) -> Array:
-        """Convert points in [0, 1] counted from the end of the line with known joints to points
-        counted from its beginning.
+        """Convert points in [0, 1], counted from that end of the line at which the joints are
+        known, to points counted from the beginning of the line.
         """
         return 1.0 - way if at_end else way
 
@@ -418,13 +418,16 @@ def pressing(
     """Compute a phase in which the contact forces rise from zero, or fall to zero, while box and
     arms stand still.
 
-    While the arms take over the weight of the box, the load on its support falls by the same
-    profile. So friction is never used more than while the box is held.
+    All forces have the same profile in time, and the load on the support of the box falls as they
+    rise. So the ratio of tangential to normal force is that of the held box throughout.
 
     Args:
         motion, hold: motion and forces of the phase that follows a rise, or precedes a fall.
         sample: 0 for a rise to the first sample of that phase, -1 for a fall from its last sample.
         rate: largest rate of change of a normal force [N/s].
+
+    Returns:
+        Motion and forces of the phase.
     """
     peak = float(hold.normal[sample].max())
     duration = at_even_steps(PEAK_RATE * peak / rate, TICK)
@@ -445,6 +448,9 @@ def waiting(motion: PhaseMotion, sample: int, duration: float) -> tuple[PhaseMot
         motion: motion of the phase before or after.
         sample: 0 to stand where this motion begins, -1 to stand where it ends.
         duration: least duration of the phase [s]; it is rounded up to whole ticks.
+
+    Returns:
+        Motion and forces of the phase; the forces are zero.
     """
     time = np.linspace(0.0, at_even_steps(duration, TICK), PHASE_SAMPLES)
     still = standing_still(motion, sample, time)

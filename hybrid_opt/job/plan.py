@@ -259,8 +259,13 @@ def job_geometry(workcell: Workcell, everywhere: bool = False) -> CellGeometry:
 
 
 def _behind_pad(body: CollisionBody, geometry: CellGeometry) -> bool:
-    """Return True if a body of the cell `geometry` moves with the pads of an arm and lies behind
-    the plane of one of them. Pads that approach against their own normal do not count.
+    """Return True if a body moves rigidly with the pads of an arm and lies behind the plane of one
+    of them, on the side away from the box. Pads whose normal points against the arm's direction of
+    approach do not count.
+
+    Args:
+        body: body of the cell.
+        geometry: bodies and arms of the cell.
     """
     arm, workcell = body.frame.robot, geometry.workcell
     if arm < 0 or body.frame.joint != len(geometry.arms[arm].axes) - 1:

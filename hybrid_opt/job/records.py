@@ -131,8 +131,8 @@ class Phase:
 
     @property
     def most_used(self) -> str:
-        """Name of the limit with the largest ratio of value to limit; limits of `_STATIC` do not
-        count.
+        """Name of the limit with the largest ratio of value to limit. Friction, path speed, joint
+        positions and the least normal force are not considered.
         """
         use = {name: ratio for name, ratio in self.use.items() if name not in _STATIC}
         return max(use, key=lambda name: use[name])
@@ -267,8 +267,8 @@ class SampledJob:
 
     @property
     def phase_names(self) -> tuple[str, ...]:
-        """Names (n,) of the phase of each sample. A sample between two phases counts to the earlier
-        one.
+        """Names (n,) of the phase of each sample. A sample at the boundary of two phases belongs to
+        the earlier one.
         """
         names: list[str] = []
         for phase, last in zip(self.job.phases, self.last, strict=True):

@@ -233,14 +233,15 @@ def _between(slow: _Slowdown, fast: _Slowdown) -> float:
 
 
 def _averaged(grid_speed: Array, width: float) -> tuple[Array, Array, Array]:
-    """Average the path parameter u(t) of a timing over a window.
+    """Average the path parameter u(t) of a timing over a moving window of time, so that its
+    acceleration has no jumps.
 
     Args:
         grid_speed: path speeds u' on a uniform grid of u [1/s].
         width: half the width of the window [s].
 
     Returns:
-        u, u' [1/s] and u'' [1/s^2] at samples that are `STEPS_PER_SAMPLE` averaging steps apart.
+        u, u' [1/s] and u'' [1/s^2] at times that are `STEPS_PER_SAMPLE` steps of the average apart.
     """
     intervals = len(grid_speed) - 1
     grid = np.linspace(0.0, 1.0, intervals + 1)

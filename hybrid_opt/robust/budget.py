@@ -198,7 +198,7 @@ def largest_forces(
 ) -> Array:
     """Compute the largest robust normal force (2,) of each robot over a motion [N].
 
-    At each pose of the motion the box is held both moving and at rest.
+    Each pose of the motion is held twice: with its time derivatives, and at rest.
 
     Args:
         model: computes robust forces of the workcell.
@@ -246,7 +246,7 @@ def cheapest_remedies(
 
 def reserve(model: RobustModel, motion: HeldMotion, required: Array, allowed: Array) -> Reserve:
     """Compute the largest payload, and the least friction, with which the required forces along a
-    motion stay within the reference forces.
+    motion stay within the reference forces. Each is changed alone.
 
     Args:
         model: computes robust forces of the workcell.
@@ -266,12 +266,13 @@ def reserve(model: RobustModel, motion: HeldMotion, required: Array, allowed: Ar
 
 
 def _last_factor(excess: Callable[[float], float], near: float, far: float) -> float:
-    """Find the factor closest to `far` at which a function is zero or negative.
+    """Search from `near` towards `far` for the last factor at which a function is not positive. The
+    function may change its sign once.
 
     Args:
         excess: function of the factor.
-        near: start of the searched range of factors.
-        far: end of this range, larger or smaller than `near`.
+        near: factor at which the search begins.
+        far: other end of the searched range, larger or smaller than `near`.
 
     Returns:
         The factor; NaN if the function is positive at `near`.
@@ -287,11 +288,12 @@ def _last_factor(excess: Callable[[float], float], near: float, far: float) -> f
 def _excess(
     model: RobustModel, motion: HeldMotion, required: Array, allowed: Array
 ) -> Callable[[Workcell], float]:
-    """Return a function of a changed cell that tells whether its forces fit the reference forces.
+    """Return a function that tells by how much the required forces of a changed cell exceed the
+    reference forces.
 
-    The function returns the largest ratio of a required force to the reference force, minus one.
-    The required forces of a changed cell are `required` times the ratio of its robust forces to
-    those of the unchanged cell.
+    The function takes the changed cell. It returns the largest ratio of a required force to its
+    reference force, minus one: zero if the forces just fit. The required forces of the changed cell
+    are `required` times the ratio of its robust forces to those of the unchanged cell.
 
     Args:
         model: computes robust forces of the unchanged cell.
@@ -382,10 +384,10 @@ def _of_cell(workcell: Workcell, excess: Callable[[Workcell], float]) -> Iterato
 
 
 def _smallest_change(excess: Callable[[float], float], far: float) -> float | None:
-    """Find the factor closest to one at which a function is zero or negative.
+    """Search from 1 towards `far` for the first factor at which a function is not positive.
 
     Args:
-        excess: function of the factor, positive at one.
+        excess: function of the factor, positive at 1.
         far: other end of the searched range of factors.
 
     Returns:

@@ -169,10 +169,9 @@ class GoverningCases:
         pose.
 
         Args:
-            commanded: (n, 2, m) derivatives of both robots' least forces in the case
-                `self.commanded` of each sample.
-            leading: (n, 2, m) derivatives of both robots' least forces in the case `self.leading`
-                of each sample.
+            commanded: (n, 2, m) derivatives of both robots' least forces at each sample, in the
+                case whose index is `self.commanded`.
+            leading: (n, 2, m) the same derivatives in the case whose index is `self.leading`.
         """
         follower, share = 1 - self.leader, self.leading_share
         found = np.empty_like(commanded)
@@ -183,12 +182,12 @@ class GoverningCases:
 
 
 def transmitted_share(difference: Array, uncertainty: Uncertainty) -> Array:
-    """Compute the share of the difference of both normal forces that acts on the leading
-    (position-controlled) arm, for the payload mass that loads this arm most.
+    """Compute which share of the difference between leading and commanded normal force acts on the
+    leading (position-controlled) arm, for the payload mass that loads this arm most.
 
-    If the difference is positive, the largest mass loads the arm most, and the share is 1. If it is
-    negative, the least mass does, and the share is (1 - s) / (1 + s) with the relative uncertainty
-    s of the mass.
+    The difference is proportional to the mass. Where it is positive, the largest mass loads the arm
+    most, and the share is 1. Where it is negative, the least mass does, and the share is (1 - s) /
+    (1 + s) with the relative uncertainty s of the mass.
 
     Args:
         difference: leading minus commanded normal force for the largest mass [N], of any shape.
@@ -208,17 +207,18 @@ def governing_cases(
     difference: Array | None = None,
     leading_share: float = 1.0,
 ) -> GoverningCases:
-    """Find the worst cases that decide the normal forces at n samples.
+    """Find for each of n samples the worst cases that decide the normal forces: the case with the
+    largest commanded force, and the case that adds most to the position-controlled arm's force.
 
-    The motion fixes the difference of both robots' normal forces. This difference does not depend
-    on the squeeze, and is proportional to the mass.
+    The position-controlled arm's force is `leading_share` times the commanded force plus a
+    difference. The motion and the case fix this difference, which is proportional to the mass and
+    does not depend on the squeeze.
 
     Args:
         worst: (k, n, 2) least normal forces of both robots in k cases at n samples [N].
         uncertainty: ranges of the uncertain quantities.
         leader: index of the position-controlled arm.
-        difference: (k, n) normal force of the position-controlled arm minus `leading_share` times
-            the commanded force [N]; None to compute it from `worst`.
+        difference: (k, n) the difference [N]; None to compute it from `worst`.
         leading_share: rise of the position-controlled arm's force per newton of commanded force.
     """
     follower, every = 1 - leader, np.arange(worst.shape[1])

@@ -183,7 +183,9 @@ class SampledCheck:
 
     @property
     def hardest(self) -> str:
-        """Text that states the ratio `closest`."""
+        """Ratio `closest` in percent, as a text; with 'at most' before it if only an upper bound is
+        known.
+        """
         most = "at most " if self.closest == SCREENED else ""
         return f"{most}{100.0 * self.closest:.2f} %"
 
@@ -284,15 +286,15 @@ class RobustModel:
     def least(
         self, motion: HeldMotion, cases: Array, leader: int, threads: int, displaced: bool
     ) -> Array:
-        """Compute the least normal forces (m, 2) [N] with which both robots hold one case per
-        sample.
+        """Compute the least normal forces (m, 2) [N] that hold the box at m samples, each in a case
+        of its own.
 
-        The force of the leading arm is the one that results from the commanded force of the other
-        arm.
+        The least commanded force is computed; the force of the leading (position-controlled) arm
+        results from it.
 
         Args:
             motion: box motion at m samples.
-            cases: (m, 18) one case per sample.
+            cases: (m, 18) the case at each sample.
             leader: index of the leading arm.
             threads: number of threads, 0 for one per core.
             displaced: True if any case displaces a pad; False is faster.
@@ -303,13 +305,14 @@ class RobustModel:
     def slack(
         self, motion: HeldMotion, cases: Array, force: Array, leader: int, threads: int = 1
     ) -> Array:
-        """Test by `case_slack_function` whether commanded forces hold one case per sample.
+        """Test whether commanded forces hold the box at m samples, each in a case of its own, by
+        the compiled function `case_slack_function`.
 
         Args:
             motion: box motion at m samples.
-            cases: (m, 18) one case per sample.
+            cases: (m, 18) the case at each sample.
             force: (m,) commanded normal forces [N].
-            leader: index of the leading arm.
+            leader: index of the leading (position-controlled) arm.
             threads: number of threads, 0 for one per core.
 
         Returns:
@@ -320,14 +323,14 @@ class RobustModel:
         return self._slack(1 - leader).batch(*given, threads=threads)["slack"].ravel()
 
     def least_squeeze(self, motion: HeldMotion, cases: Array, leader: int = 0) -> Array:
-        """Compute the least normal forces (k, n, 2) [N] with which both robots hold k cases at n
-        samples.
+        """Compute the least normal forces (k, n, 2) [N] that hold the box in each of k cases at
+        each of n samples.
 
         Args:
             motion: box motion at n samples.
             cases: (k, 18) cases, each applied to all samples.
-            leader: index of the leading arm; its force results from the commanded force of the
-                other arm.
+            leader: index of the leading (position-controlled) arm; its force results from the
+                commanded force of the other arm.
         """
         displaced = bool(cases[:, 11:15].any())
         n = len(motion.pose)
@@ -411,17 +414,17 @@ class RobustModel:
         leader: int = 0,
         above: Array | float = 0.0,
     ) -> Array:
-        """Compute the least commanded normal force (n,) [N] that holds every case, faster than
-        `hold`; infinite where none does.
+        """Compute the least commanded normal force (n,) [N] that holds every case of an
+        uncertainty, in less time than `hold`; infinite at samples where no force does.
 
-        At a few samples `slack` finds the cases with the largest forces, and the forces of these
-        cases are computed. `slack` proves that most other cases need no more. At most `SAMPLES`
-        samples are checked in all cases, the others only in the cases that govern at these samples.
+        At most `SAMPLES` samples are checked in all cases, the others only in the cases that need
+        the largest forces at these samples. `slack` proves for most cases that they do not need the
+        largest force, so only few forces are computed.
 
         Args:
             motion: box motion at n samples.
             uncertainty: ranges of the uncertain quantities.
-            leader: index of the leading arm.
+            leader: index of the leading (position-controlled) arm.
             above: lower bound of the result, one per sample (n,) or one for all samples [N].
         """
         cases, n = self.worst_cases(uncertainty, leader), len(motion.pose)
@@ -532,14 +535,14 @@ class RobustModel:
         leader: int,
         threads: int = 1,
     ) -> Array:
-        """Compute the force that each of k cases needs at n samples, over the commanded force.
+        """Compute the ratio of needed to commanded force in each of k cases at n samples.
 
         Args:
             motion: box motion at n samples.
             force: (n,) commanded normal forces [N].
             cases: (k, 18) cases of the uncertainty, each applied to all samples.
-            screened: ratios below this one are not computed exactly; they are returned as
-                `screened`.
+            screened: ratios below this one are not computed; the result has this value in their
+                place.
             leader: index of the position-controlled arm.
             threads: number of threads, 0 for one per core.
 
@@ -559,10 +562,11 @@ class RobustModel:
         return share.reshape(k, n)
 
     def _friction_left(self, cases: Array) -> float:
-        """Compute the least share of the friction coefficient that displaced pads leave in k cases,
-        less a reserve.
+        """Compute a lower bound of the share of the friction coefficient that remains if pads are
+        displaced, for all of k cases.
 
-        `slack` ignores displacements; forces are scaled by this share to make up for it.
+        `slack` ignores displacements. Forces are multiplied by this share before the test, so that
+        it remains a proof.
 
         Args:
             cases: (k, 18) cases of the uncertainty.
@@ -596,8 +600,8 @@ class RobustModel:
 
 
 def allowed_factor(workcell: Workcell, uncertainty: Uncertainty) -> float:
-    """Find the largest factor on the ranges of an uncertainty that leaves some friction and contact
-    patch, at most `LARGEST_FACTOR`.
+    """Find the largest factor on the ranges of an uncertainty, at most `LARGEST_FACTOR`, with which
+    friction, contact patches and mass remain positive in every case.
 
     Args:
         workcell: the cell.

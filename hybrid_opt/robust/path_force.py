@@ -168,8 +168,8 @@ class RobustPath:
         return rows, governing_cases(known, self._set, LEADER, beyond, self._share)
 
     def most_demanding(self, points: PathPoints, count: int) -> tuple[Array, Array]:
-        """Compute the forces, with their derivatives, of several cases of the uncertainty at each
-        of n points: those with the largest commanded forces.
+        """Compute the normal forces in the `count` cases of the uncertainty that need the largest
+        commanded forces, at each of n points, with derivatives.
 
         A polish needs several cases, because the case with the largest force changes along the
         path, and with it the derivative.
@@ -276,17 +276,17 @@ class GoverningForce:
     def slopes(
         self, low: Workcell, high: Workcell, motions: tuple[BoxMotion, BoxMotion], pads: bool
     ) -> tuple[float, float]:
-        """Compute how much the force changes [N] between this cell and two neighbouring cells.
+        """Compute how much the force changes [N] if one number of the cell is raised or lowered.
 
         Args:
-            low, high: cells in which one number is lower, and higher by the same amount, than in
+            low, high: cells in which the number is lower, and higher by the same amount, than in
                 this cell.
             motions: box motions in the cell `low` and in the cell `high`, at `samples`.
-            pads: True if the two cells' pads differ. Then the forces of pads without opposite
-                normals are computed anew.
+            pads: True if the pads of `low` and `high` differ. The forces of pads without opposite
+                normals are then computed anew.
 
         Returns:
-            Change of the force towards `high`, and change towards `low`.
+            Change of the force from this cell to `high`, and from this cell to `low`.
         """
         before, after = (
             self._inputs(cell, at, pads) for cell, at in zip((low, high), motions, strict=True)

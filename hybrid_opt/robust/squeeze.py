@@ -239,8 +239,8 @@ def _in_every_case(
     motion: HeldMotion,
     planned: Array | float,
 ) -> Array:
-    """Compute the force (n,) [N] of the force-controlled arm that holds the box in every case of an
-    uncertainty, both moving and at rest at the same poses.
+    """Compute the least force (n,) [N] of the force-controlled arm that holds the box in every case
+    of an uncertainty at each of n poses, with the motion's derivatives as well as at rest.
 
     Args:
         model: computes robust forces of the workcell.
@@ -306,11 +306,11 @@ def commanded_forces(
 
 
 def smooth_above(time: Array, values: Array, width: float) -> Array:
-    """Compute a smooth curve that is nowhere below a given curve, and level at both ends.
+    """Compute a smooth curve that is nowhere below a given curve and has zero slope at both ends.
 
     At each time the maximum of the curve within a window is taken, and these maxima are averaged
-    over the same window with a smooth kernel. So the result at each time is an average of values
-    that are at least the value of the curve there.
+    over the same window with a smooth kernel. Each averaged maximum belongs to a window that
+    contains the time in question, so the average is not below the curve there.
 
     Args:
         time: (n,) times, not decreasing [s].
@@ -318,7 +318,7 @@ def smooth_above(time: Array, values: Array, width: float) -> Array:
         width: half the width of the window [s].
 
     Returns:
-        Values (n,) of the smooth curve.
+        Values (n,) of the smooth curve, in the unit of `values`.
     """
     count = max(2, int(np.ceil((time[-1] - time[0]) / STEP)) + 1)
     grid = np.linspace(time[0], time[-1], count)
