@@ -238,14 +238,15 @@ class _Sweep:
     def _measure(self, work: Intervals, end: End, last: bool) -> NDArray[np.intp]:
         """Measure distances of bodies at the first or the last configuration of m intervals.
 
-        A pair is measured if it is not proven to be free in the interval, and its distance bound is
-        so small that further halving would take longer than the measurement. The measured distances
-        replace the bounds in `end`.
+        A pair is measured at this configuration if three conditions hold: it has not been measured
+        there before, it is not yet proven to be free of collisions in the interval, and its
+        distance bound is so small that halving the interval again would cost more than the
+        measurement. The measured distances replace the bounds in `end`.
 
         Args:
             work: the intervals.
             end: configurations and distance bounds at this end of each interval.
-            last: True to measure every pair that is not proven to be free, whatever its bound.
+            last: True to drop the condition on the bound.
 
         Returns:
             (m,) index of the first pair that collides at this end of each interval; -1 for none.

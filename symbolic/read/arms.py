@@ -68,16 +68,16 @@ def held_joints(urdf: Urdf, moving: Sequence[str], locked: Positions) -> Positio
     """Return the joints of a description that do not move, each with its position [rad or m].
 
     The position is the one in `locked`, else zero or the limit closest to zero. The position of a
-    joint that mimics such a joint follows from it.
+    joint that mimics a joint that does not move follows from it.
 
     Args:
         urdf: the description.
-        moving: joints that move.
+        moving: joints that move the flange.
         locked: joints that the user holds, with their positions [rad or m].
 
     Raises:
-        RobotModelError: a locked joint does not exist, a joint of the chain mimics another joint,
-            or a joint with a shape or mass behind it mimics a moving joint.
+        RobotModelError: a locked joint does not exist, one of `moving` mimics another joint, or
+            another joint mimics one of `moving` and moves a link with a shape or mass.
     """
     given = dict(locked)
     free = [name for name, joint in urdf.joints.items() if joint.kind != "fixed"]
@@ -193,7 +193,8 @@ def without_links(urdf: Urdf, patterns: tuple[str, ...]) -> Urdf:
 
 
 def listed(names: Sequence[str], most: int = 20) -> str:
-    """Return names for a message, separated by commas; after `most` names the rest is counted."""
+    """Return names for a message, separated by commas: at most `most` names, then the number of the
+    rest."""
     text = ", ".join(repr(name) for name in names[:most]) or "none"
     return f"{text} and {len(names) - most} more" if len(names) > most else text
 
@@ -346,7 +347,8 @@ def structure_problem(model: pin.Model) -> str:
 
 
 def flange_problem(model: pin.Model, flange: str) -> str:
-    """Return why the frame `flange` of a model cannot carry the tool; '' if it can."""
+    """Return why the frame `flange` of a model cannot carry the tool: it is no link, or the last
+    joint does not move it. The result is '' if it can."""
     bodies = [frame.name for frame in model.frames if frame.type == pin.FrameType.BODY]
     tip = model.njoints - 1
     last = [x for x in bodies if model.frames[link_frame(model, x)].parentJoint == tip]
@@ -381,10 +383,11 @@ thirteen arms of 0.74 to 1.75 m are below it, 6 % for a GoFa 12."""
 
 
 def usual_manipulability(model: pin.Model, flange: str) -> float:
-    """Compute the default of the least allowed manipulability of an arm, to two digits [m^3].
+    """Compute the default lower bound of an arm's manipulability, rounded to two digits [m^3].
 
-    The default scales with the cube of the arm's length, as the manipulability does. The length
-    covers the last seven joints, without joints that move the whole arm, such as a lift.
+    It is proportional to the cube of the arm's length, as the manipulability itself is. The length
+    is the sum of the distances between the last seven joints and to the flange, so it excludes
+    earlier joints that move the whole arm, such as a lift.
 
     Args:
         model: model of the arm.
@@ -432,8 +435,16 @@ def one_machine(robots: Arms) -> bool:
 
 
 def arm_links(robots: Arms, i: int) -> ArmLinks:
-    """Return the links that are modelled as bodies of arm i (0 or 1) of two robots, which may be
-    one machine."""
+    """Return the links that are collision bodies of arm i (0 or 1), and the link on which it is
+    mounted.
+
+    If both arms belong to one machine, each link that both descriptions contain becomes a body of
+    one arm only.
+
+    Args:
+        robots: both arms.
+        i: index of the arm.
+    """
     carried = _carriers(robots[i])
     still = [link for link in carried if carried[link] == UNMOVED]
     moved = [link for link in carried if carried[link] != UNMOVED]
@@ -503,9 +514,10 @@ def _is_behind(urdf: Urdf, link: str, joints: Collection[str]) -> bool:
 
 
 def _carriers(robot: Robot) -> dict[str, str]:
-    """Return for each link with shapes, by its name, the last arm joint before the link.
+    """Return for each link with a collision shape the name of the arm's joint that moves it.
 
-    It is a name, 'universe' for a link that does not move.
+    This is the last of the arm's joints between the root and the link; 'universe' for a link that
+    no joint of the arm moves.
     """
     model = arm_model(robot)
     links = robot_urdf(robot).collisions

@@ -64,13 +64,15 @@ def load(
 
     Args:
         path: the file; every path inside it is relative to its folder.
-        checks: further checks of an otherwise valid workcell, e.g. inverse kinematics at the
-            start; each yields its problems as `key.path: what was found; what is allowed`.
-        stored: whether the workcell was unpacked from an archive. Missing packages are then not
+        checks: further checks of an otherwise valid workcell, e.g. inverse kinematics at the start.
+            Each returns its problems as texts `key.path: what was found; what is allowed`.
+        stored: True if the workcell was unpacked from an archive. Missing packages are then not
             looked for on this machine, and xacro files are already expanded.
-        decided: for each robot the start branch that replaces "search" in the file.
-        text: content to read in place of the file's content; None for the file's content.
-        reach: whether fixed poses have to be within the arms' reach; False if bases or rotations of
+        decided: for each robot the index of the start branch (a posture with which the arm can hold
+            the box at the start) that replaces "search" in the file; `SEARCHED_BRANCH` leaves
+            "search" in place.
+        text: content to read in place of the file's content; None to read the file.
+        reach: True if fixed poses have to be within the arms' reach; False if bases or rotations of
             pads are still to be chosen.
 
     Raises:
@@ -241,10 +243,12 @@ def _content(path: Path, most: int) -> bytes:
 def with_branches(content: bytes, data: Mapping[str, Any], decided: tuple[int, int]) -> bytes:
     """Return the text of a workcell file in which chosen start branches replace "search".
 
+    A start branch is a posture with which an arm can hold the box at the start, given by its index.
+
     Args:
         content: content of the file.
         data: parsed content of the file.
-        decided: for each robot the index of the chosen branch.
+        decided: for each robot the index of the chosen branch; `SEARCHED_BRANCH` for no choice.
 
     Raises:
         SettingsError: the file is written in a way that cannot be edited.
@@ -404,7 +408,8 @@ def _check_unique(entries: list[tuple[str, str]], problems: Problems) -> None:
 
 
 def check_contacts(workcell: Workcell, problems: Problems) -> None:
-    """Record a problem if the pads cannot hold the payload under every motion."""
+    """Record a problem if the task's contact model cannot hold the payload with these contacts
+    under every motion."""
     if not problems.clean("contacts", "task.allocation", *SHAPE_KEYS):
         return
     if problem := contact_model(workcell).problem:
@@ -412,8 +417,13 @@ def check_contacts(workcell: Workcell, problems: Problems) -> None:
 
 
 def check_uncertainty(workcell: Workcell, problems: Problems) -> None:
-    """Record a problem if displaced pads may leave their patches, or patches no longer face each
-    other."""
+    """Record a problem if the stated uncertainty of the pads' positions
+    (`uncertainty.pad_position`) is too large.
+
+    It is too large if a pad may be displaced by more than its patch radius, or so far that the two
+    patches no longer face each other. Only two round pads with opposite normals may have such an
+    uncertainty.
+    """
     displaced = workcell.uncertainty.pad_position
     if not (displaced and workcell.uncertainty.stated) or not problems.clean(
         "uncertainty", "contacts", *SHAPE_KEYS
@@ -488,8 +498,8 @@ def _of_robots(*parts: str) -> list[str]:
 
 
 def check_machine(workcell: Workcell, problems: Problems) -> None:
-    """Record a problem if two arms of one machine do not move independently, or disagree on fixed
-    links."""
+    """Record a problem if both arms are in one description at one base, but do not move
+    independently or hold a common joint at different positions."""
     if problems.clean(*_of_robots(*ARM_KEYS)) and (problem := machine_problem(workcell.robots)):
         problems.add("robots[1].chain", problem)
 

@@ -74,7 +74,7 @@ def collect_cell(workcell: Workcell) -> CellFiles:
     """Collect the files of a workcell that was read with `symbolic.read.cell.load`.
 
     Raises:
-        BundleError: the file no longer describes this workcell, or a reference cannot be made
+        BundleError: a file was changed after the workcell was read, or a reference cannot be made
             relative.
     """
     known = workcell.source, workcell.digest, workcell.start_branch, workcell.text
@@ -221,8 +221,11 @@ def _packed(name: str, content: bytes) -> StoredFile:
 
 @lru_cache(maxsize=32)
 def _compressed(content: bytes) -> str:
-    """Return compressed content as base64. A study stores its cell in several trajectories, and
-    the meshes of two robots are 10 MB."""
+    """Compress bytes with zlib and return them as base64 text.
+
+    Results are cached: a study stores its cell in several trajectory files, and the meshes of two
+    robots are 10 MB.
+    """
     return base64.b64encode(zlib.compress(content)).decode("ascii")
 
 
@@ -352,7 +355,10 @@ class CellCollector:
             self._text = completed(safe_io.text(self._text), stated, changes).encode()
 
     def layout(self) -> tuple[str, dict[str, bytes], tuple[str, ...]]:
-        """Return all collected files, with paths moved such that none leads upwards.
+        """Return all collected files, with paths below one common folder.
+
+        Paths of collected files are relative to the workcell file and may contain '..'. If so, the
+        workcell file is put into as many subfolders as the longest sequence of '..' needs.
 
         Returns:
             The path of the workcell file, the content of every file by path, and the package
@@ -518,7 +524,8 @@ def _meshes(bodies: Any) -> Iterator[tuple[str, None]]:
 
 
 def drivable_files(stored: CellFiles) -> CellFiles:
-    """Return the files of a cell (`collect_cell`) with the time law changed to `OPTIMAL`.
+    """Return the files of a cell (`collect_cell`) with the time law changed to 'optimal': timed
+    from rest to rest within all limits of the robots.
 
     Raises:
         BundleError: the file writes the task in a way that cannot be changed line by line, or the

@@ -104,7 +104,8 @@ def package_in(folder: Path, name: str) -> Path | None:
 
 
 def _package_name(folder: Path) -> str | None:
-    """Return the name in a folder's package.xml; None if there is no such file."""
+    """Return the name that a folder's package.xml states; None if the file is missing, cannot be
+    read or states none."""
     file = folder / "package.xml"
     if not file.is_file():
         return None
@@ -159,13 +160,14 @@ def _below(folder: Path, name: str, levels: int) -> Iterator[Path]:
 def resolve_mesh(address: str, urdf: Path, package_dirs: Sequence[Path]) -> Path | None:
     """Return the file behind a mesh address of a URDF, or None if it does not exist.
 
-    `package://NAME/REST` is looked up in the package NAME of each folder (`package_in`), `file://`
-    addresses are absolute, and other addresses are relative to the folder of the URDF.
+    For `package://NAME/REST` it is the first existing file REST in a package NAME, which
+    `package_in` finds inside each folder of `package_dirs`. A `file://` address is absolute; any
+    other address is relative to the folder of the URDF.
 
     Args:
         address: the address in the URDF.
         urdf: path of the URDF.
-        package_dirs: folders in which packages are looked up.
+        package_dirs: folders in which packages are looked up, in order.
     """
     if address.startswith(PACKAGE_SCHEME):
         name, _, rest = address.removeprefix(PACKAGE_SCHEME).partition("/")
@@ -261,10 +263,11 @@ _NOMINAL = re.compile(r"default_kinematics\.ya?ml$", re.IGNORECASE)
 
 
 def nominal_kinematics(content: bytes, arguments: Arguments) -> str:
-    """Return the name of the xacro argument for an arm's calibration if no calibration is given.
+    """Return the name of the xacro argument that should state an arm's measured kinematics, if no
+    measured values are given.
 
-    The value is then missing, or is the maker's nominal one. The result is '' if a calibration is
-    given or the file has no such argument.
+    None are given if the argument has no value, or if its value is the maker's nominal file. The
+    result is '' if measured kinematics are given, or if the file has no such argument.
 
     Args:
         content: content of the xacro file.
@@ -309,8 +312,11 @@ def _expanded(
 
 
 def _answer(request: Any) -> Any:
-    """Send a request to a new process that expands xacro, and return the answer. Both are JSON
-    values; the answer is None if the process exceeds its time or memory."""
+    """Send a request to expand a xacro file to a new process, and return that process's answer.
+
+    Request and answer are JSON values. The answer is None if the process exceeds its limit of time
+    or memory.
+    """
     paths = [os.path.abspath(entry) for entry in sys.path]
     with tempfile.TemporaryFile() as answer:
         try:
@@ -366,7 +372,11 @@ _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 
 
 def main() -> int:
-    """Answer the request on standard input; return the exit code."""
+    """Expand the xacro file that a JSON request on standard input names, and write the answer as
+    JSON to standard output.
+
+    This function runs in a process of its own. It returns the exit code.
+    """
     request = json.load(sys.stdin)
     path = Path(request["path"])
     answer, sys.stdout = sys.stdout, io.StringIO()
@@ -459,7 +469,10 @@ def _expand(
 
 
 def _opened(name: str) -> io.StringIO:
-    """Open an included file within the size limits. A missing file may be optional."""
+    """Open an included file within the size limits.
+
+    A missing file raises `FileNotFoundError`, which xacro ignores for an optional include.
+    """
     if not os.path.exists(name):
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), name)
     try:
@@ -483,11 +496,12 @@ def _by_package(address: str, packages: Mapping[str, Path]) -> str:
 
 
 def _refusal(error: BaseException, xacro: Any) -> OutsideError:
-    """Convert an error of an expansion to an `OutsideError` that names the file and the macro.
+    """Convert an error of an expansion to an `OutsideError` whose message names the file and the
+    macro.
 
     Args:
         error: the error.
-        xacro: the module `xacro`, which knows the place.
+        xacro: the module `xacro`; its stacks of files and macros show where the error arose.
     """
     causes = [error]
     for one in causes:  # an error and those that it was made of

@@ -30,7 +30,8 @@ def completed(text: str, data: Mapping[str, Any], changes: Changes) -> str:
     """Return the text of a workcell file with some values set.
 
     Args:
-        text: text of the file; '' to write `data` with the changes, without comments.
+        text: text of the file; '' to write a new text from `data` and the changes, without
+            comments.
         data: parsed content of the file.
         changes: nested tables with the values to set; None removes a key.
 
@@ -139,9 +140,9 @@ def merged(data: Any, changes: Any) -> Any:
     """Merge nested changes into nested values; None in the changes removes a key.
 
     Args:
-        data: the values, or other changes to be merged with.
-        changes: the changes. An array of tables is merged table by table if the lengths agree; any
-            other value replaces the old one.
+        data: nested tables and arrays of a workcell file, or earlier changes of them.
+        changes: the changes. An array of tables is merged table by table if both arrays have the
+            same length; any other value replaces the old one.
     """
     if isinstance(changes, Mapping) and isinstance(data, Mapping):
         found = dict(data)
@@ -179,9 +180,10 @@ def _apply(place: Any, changes: Any) -> None:
 
 
 def _cut_heading(place: Any) -> list[Any]:
-    """Remove and return the blank lines and comments at the end of a table's text.
+    """Remove and return the blank lines and comments at the end of a table's text, from the first
+    blank line on.
 
-    They belong to the next table, so new keys go before them.
+    They belong to the next table, so new keys of this table are written before them.
     """
     body = _last_body(place)
     blank = end = len(body)

@@ -180,13 +180,16 @@ class ArmSettings(ContactSettings):
 def scene_text(
     workcell: Workcell, settings: SimulationSettings, leader: int, disturbance: ArrayLike
 ) -> str:
-    """Return the MJCF document of a box between two pads on a carriage, without arms, for
-    `compiled`.
+    """Return the MJCF document (MuJoCo's XML) of a simulation without arms: the box between two
+    pads, which are mounted on a carriage, a heavy body that the simulation moves.
+
+    The simulation compiles the text by `compiled`.
 
     Args:
-        leader: index of the pad that is fixed to the carriage.
         workcell: the cell.
         settings: settings of the simulation.
+        leader: index (0 or 1) of the pad that is fixed to the carriage. The other pad slides on it
+            along the contact normal.
         disturbance: (3,) acceleration that the pads have to give the box in addition to the
             acceleration of the motion, world frame [m/s^2]. It acts like a change of gravity.
     """
