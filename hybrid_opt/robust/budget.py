@@ -112,7 +112,7 @@ class GripBudget:
 
     @property
     def fits(self) -> bool:
-        """Return True if each robot holds the payload at rest within its reference force."""
+        """True if each robot holds the payload at rest within its reference force."""
         return bool((self.required <= self.allowed * (1.0 + ROUNDING)).all())
 
     def __str__(self) -> str:

@@ -179,13 +179,14 @@ class Timing(Displayable):
 
     @property
     def duration(self) -> float:
-        """Return the duration [s]; infinite if there is no timing."""
+        """Duration [s]; infinite if there is no timing."""
         return self.carry.duration if self.carry is not None else float("inf")
 
     @property
     def peak_force(self) -> float:
-        """Return the largest normal force that the limits bound [N]: the robust force if robust
-        forces are limited, else the planned one. NaN if there is no timing."""
+        """Largest normal force along the carry [N]: the robust force if robust forces are limited,
+        else the planned one. NaN if there is no timing.
+        """
         if self.carry is None:
             return float("nan")
         if self.limits.force is None:
@@ -212,13 +213,14 @@ class Validation:
 
     @property
     def ratio(self) -> float:
-        """Return the duration of the timing over the duration by TOPP-RA."""
+        """Ratio of the timing's duration to the duration by TOPP-RA."""
         return self.duration / self.reference
 
     @property
     def is_confirmed(self) -> bool:
-        """Return True if the duration of the timing differs from TOPP-RA's by at most the share
-        `AGREEMENT`."""
+        """True if the duration of the timing differs from TOPP-RA's by at most the share
+        `AGREEMENT`.
+        """
         return abs(self.ratio - 1.0) <= AGREEMENT
 
 
@@ -242,8 +244,7 @@ class JerkTiming:
 
     @property
     def cost(self) -> float:
-        """Return the increase of the duration by the jerk limits, as a share of the duration
-        without them."""
+        """Increase of the duration by the jerk limits, as a share of the duration without them."""
         return self.timing.duration / self.without - 1.0
 
     def __repr__(self) -> str:
@@ -291,7 +292,8 @@ class PathTiming:
 
     @property
     def limited_force(self) -> float:
-        """Return the largest normal force that the limits bound [N]: robust if robust forces are
-        limited, else planned."""
+        """Largest normal force of both robots [N]: the robust force if robust forces are limited,
+        else the planned one.
+        """
         known = self.peak_force if self.robust_force is None else self.robust_force
         return float(known.max())
