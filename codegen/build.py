@@ -84,11 +84,16 @@ class CSource:
 
     @classmethod
     def of(cls, name: str, function: ca.Function, lanes: int, level: int | None) -> CSource:
-        """Generate the C text of a CasADi function that is called `name` in its set.
+        """Generate the C text of a CasADi function.
 
-        The text makes `lanes` evaluations side by side; a function that cannot be written for lanes
-        gets one lane, with a warning. `level` is the compiler's optimisation level; None to choose
-        by size.
+        Args:
+            name: name of the function in its set.
+            function: the function.
+            lanes: number of evaluations that the text makes side by side by vector instructions; 0
+                for the machine's width. A function that cannot be written so is evaluated one by
+                one, with a warning.
+            level: optimisation level of the compiler, 0 to 3; None to choose by the size of the
+                text.
         """
         from codegen.source import c_source, dense, generated_c, operations
 
@@ -119,7 +124,7 @@ class Library:
         """Return the library's content as a numeric function.
 
         Raises:
-            CodegenError: the library has no batch driver.
+            CodegenError: the library has no batch driver, the C function that evaluates batches.
         """
         signature = Signature.from_json(self.entry.facts["signature"])
         return CompiledFunction(signature, self.entry.library, self.handle)
@@ -315,7 +320,8 @@ def load_or_build(
 
 
 def _stored(tape: Tape, cache: Cache) -> StoredTape:
-    """Store a tape in the cache, and return the entry."""
+    """Store a tape (the instructions of a CasADi function) in the cache, and return the stored
+    tape."""
     signature = tape.signature.to_json()
     content = tape.instructions.tobytes().hex()
     key = key_of("tape", signature=signature, slots=tape.slots, content=content)

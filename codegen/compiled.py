@@ -58,7 +58,8 @@ class CompiledFunction(NumericFunction):
             loaded: ctypes handle of the library.
 
         Raises:
-            CodegenError: the library has no driver.
+            CodegenError: the library lacks the C functions of a batch driver, by which batches are
+                evaluated.
         """
         super().__init__(signature)
         self.library = library

@@ -122,7 +122,8 @@ class Tape:
         return cls(signature, np.load(path, allow_pickle=False), slots)
 
     def save(self, path: Path) -> None:
-        """Write the instructions, without signature and slots, to a NumPy file."""
+        """Write the instructions to a NumPy file. Signature and number of slots are not written;
+        `load` takes them as arguments."""
         np.save(path, self.instructions, allow_pickle=False)
 
 

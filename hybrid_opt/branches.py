@@ -121,7 +121,9 @@ class _Pair:
         self._parts: list[Evaluations] = []
 
     def search(self, algorithm: str, evaluations: int, rng: np.random.Generator) -> None:
-        """Run one more round of the pair: a search that starts with its best candidates so far.
+        """Search with this pair of start branches, as one more round of the competition.
+
+        The first generation contains the pair's best candidates of earlier rounds.
 
         Args:
             algorithm: name of the search algorithm.
@@ -136,7 +138,8 @@ class _Pair:
         self.rounds += 1
 
     def try_out(self, x: Array) -> bool:
-        """Evaluate candidates, and return True if both arms can follow at least one of them.
+        """Evaluate candidates with this pair of start branches; return True if both arms can follow
+        at least one of them.
 
         Args:
             x: (n, n_var) decision vectors.
@@ -146,7 +149,7 @@ class _Pair:
         return bool(np.any(np.all(found.violation[:, _HOLDING] <= 0.0, axis=1)))
 
     def result(self) -> PairResult:
-        """Return the result of the pair so far."""
+        """Return the figures of this pair of start branches over all its candidates."""
         known = concatenated(self._parts)
         rows = front_rows(known.objectives, known.feasible)
         volume = hypervolume(known.objectives[rows], REFERENCE_POINT) if len(rows) else 0.0

@@ -298,7 +298,9 @@ class Cell:
     def force_kind(self) -> ForceKind:
         """Kind of force that force limits of drivable carries bound.
 
-        It is the robust force if the objectives contain robust forces, else the planned force.
+        It is the robust force, which holds the box in every case of the uncertainty, if the
+        objectives contain robust forces. Otherwise it is the planned force, which holds the box if
+        everything is exactly as described.
 
         Raises:
             SettingsError: an objective is unknown.

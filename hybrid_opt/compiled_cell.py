@@ -69,9 +69,8 @@ class CompiledCell:
         self._loaded: dict[object, Any] = {}
 
     def with_parameters(self, workcell: Workcell) -> CompiledCell:
-        """Return the compiled functions of another workcell, which differs only in parameters. Both
-        objects share the loaded libraries.
-        """
+        """Return the compiled functions of another workcell, which differs only in parameters:
+        numbers that are inputs of compiled functions. Both objects share the loaded libraries."""
         other = CompiledCell(workcell, self.cache)
         other._loaded, other._is_changed = self._loaded, True
         return other
@@ -161,7 +160,8 @@ class CompiledCell:
 
     @cached_property
     def numbers(self) -> CellParameters:
-        """Parameters and topology of the cell."""
+        """Parameters of the cell, numbers that are inputs of compiled functions; and its topology,
+        everything whose change needs a new compilation."""
         from symbolic.parameters import CellParameters
 
         bodies = self.bodies

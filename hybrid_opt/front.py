@@ -128,8 +128,8 @@ class Front(Displayable):
     def balanced(self) -> Carry:
         """Return the carry with the least mean of the two robots' peak normal forces.
 
-        Of several carries whose means differ by less than `TIE`, the carry with the least larger
-        peak is returned.
+        Means whose relative difference is below `TIE` count as equal. Among such carries the one
+        whose more loaded robot has the lower peak is returned.
 
         Raises:
             SettingsError: the front is empty.
@@ -224,8 +224,8 @@ class SelectedCarry:
 def balanced(peak_normal_force: Array) -> int:
     """Return the index of the carry with the least mean of both robots' peak normal forces.
 
-    Of several carries whose means differ by less than `TIE`, the carry with the least larger peak
-    is chosen.
+    Means whose relative difference is below `TIE` count as equal. Among such carries the one whose
+    more loaded robot has the lower peak is chosen.
 
     Args:
         peak_normal_force: (k, 2) peak normal force of each robot in k carries [N].
@@ -259,7 +259,7 @@ def knee(points: Array) -> int:
 def select(
     evaluator: CandidateEvaluator, x: Array, rows: NDArray[np.intp] | None = None
 ) -> SelectedCarry | None:
-    """Select the carry that represents a front; return None for an empty front.
+    """Compute the selected carry of a front, as `selected_row` chooses it; None for an empty front.
 
     Args:
         evaluator: evaluator of the cell's candidates.

@@ -147,7 +147,8 @@ class Sensitivity:
 
     @property
     def change(self) -> float:
-        """Size of a usual change of the number [unit]."""
+        """Change of the number by which effects are compared, chosen by its unit: 0.001 m, 0.1 kg,
+        1 N and so on [unit]."""
         return float(USUAL_CHANGES[self.unit])
 
 

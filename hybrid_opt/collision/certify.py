@@ -322,17 +322,17 @@ class SampledPath:
 def configurations(
     paths: Sequence[SampledPath], posture: NumericFunction, owner: NDArray[np.intp], u: Array
 ) -> Array:
-    """Compute box poses and joint positions at given places of sampled paths.
+    """Compute box poses and joint positions at n path parameters of sampled paths.
 
     Args:
         paths: sampled paths of one task.
         posture: compiled `symbolic.robot.arm.posture_function`.
-        owner: (n,) index of the path of each place.
-        u: (n,) path parameter of each place.
+        owner: (n,) index in `paths` of the path to which each path parameter belongs.
+        u: (n,) path parameters in [0, 1].
 
     Returns:
-        (n, 6 + all joints) box pose and joints of both arms. Joints are NaN where Newton's method
-        does not reach the place from the neighbouring samples.
+        (n, 6 + all joints) box pose [m, rad] and joints of both arms [rad or m]. The joints are NaN
+        where Newton's method, begun between the neighbouring samples, does not reach the box pose.
     """
     basis = path_position(len(paths[0].waypoints), u)
     waypoints = np.array([path.waypoints for path in paths])

@@ -203,9 +203,10 @@ class CollisionChecker:
                 [rad].
 
         Returns:
-            Chord and bend (n, n_pairs) [m]. The chord bounds the distance that the bodies move
-            relative to each other from start to end. The bend bounds the second derivative of this
-            motion by the share of the way (`symbolic.geometry.clearance`).
+            Chord and bend (n, n_pairs) [m] of n motions that are linear in box pose and joints over
+            s from 0 (start) to 1 (end). The chord bounds the distance between the relative
+            positions at s = 0 and s = 1. The bend bounds the second derivative of the relative
+            position with respect to s (`symbolic.geometry.clearance`).
         """
         asked = [self.functions[f"{block}motion"] for block in self.geometry.asked]
         found = [function.batch(*start, *end) for function in asked]
@@ -219,8 +220,9 @@ class CollisionChecker:
     ) -> NDArray[np.intp]:
         """Replace lower bounds of chosen pairs by measured distances, in place.
 
-        A bound that exceeds the measured distance stays. If the payload may rest on a body, the
-        payload shrunk by the resting tolerance is measured, and the pair's tolerance is added.
+        A bound that is larger than the measured distance stays. If the payload may rest on the
+        other body of a pair, the measurement uses the payload shrunk by the resting tolerance, and
+        the cell's collision tolerance for the pair is added to the distance.
 
         Args:
             pose: (n, 6) box poses [m, rad].

@@ -85,9 +85,9 @@ def joint_tables(geometry: CellGeometry) -> tuple[JointTable, ...]:
     """Build tables of lower bounds of distances for pairs of bodies that compiled bounds often
     cannot decide.
 
-    A pair gets a table under three conditions. There are two joints between its bodies, both
-    turning joints of one arm. One of the bodies has a hull. The bodies are close in many postures,
-    or the arm is mounted on the earlier body.
+    A pair gets a table if all of three conditions hold. Exactly two joints lie between its bodies,
+    both revolute joints of one arm. One of the bodies has a convex hull. The bodies are close in
+    many postures, or the body nearer to the base carries the whole arm.
     """
     close, found = close_pairs(geometry), []
     for k, pair in enumerate(geometry.active):
@@ -206,13 +206,13 @@ class _PieceDistances:
     def bounds(
         self, q: Array, rows: NDArray[np.intp], moving: NDArray[np.intp]
     ) -> tuple[Array, Array]:
-        """Compute lower and upper bounds (m,) [m] of the distances of pieces (convex solids) of the
-        later link from the earlier link.
+        """Compute lower and upper bounds (m,) [m] of the distances between the link nearer to the
+        base and pieces (convex solids) of the other link.
 
         Args:
-            q: (n, 2) joint positions [rad].
-            rows: (m,) index of the joint positions of each query.
-            moving: (m,) index of the moving piece of each query.
+            q: (n, 2) positions of the two joints between the links [rad].
+            rows: (m,) index in `q` of the joint positions of each query.
+            moving: (m,) index in `moving` of the piece of each query.
         """
         # Not imported at the top: SciPy takes long to start, and cells without meshes need none.
         from scipy.spatial.transform import Rotation

@@ -230,7 +230,8 @@ class CandidateEvaluator:
             q_1, q_2: (n,) joints of each arm that hold the box at the start [rad].
 
         Raises:
-            SettingsError: candidates of this cell are not evaluated in lanes.
+            SettingsError: the compiled kernel, which evaluates several candidates side by side, is
+                not available for this cell, these objectives or this machine.
         """
         if self._kernel is None or self._needs is None:
             raise SettingsError(
@@ -262,8 +263,8 @@ class CandidateEvaluator:
 
         Args:
             x: (n, n_var) decision vectors.
-            with_collisions: False to skip the collision check, if candidates are evaluated in
-                lanes.
+            with_collisions: False to skip the collision check. Without the compiled kernel, which
+                evaluates several candidates side by side, collisions are checked in any case.
 
         Raises:
             SettingsError: x has the wrong shape.

@@ -304,7 +304,9 @@ _ROBUST = tuple(OBJECTIVES[name].evaluate for name in ("robust_force", *ROBUST_O
 def force_kind(objectives: Sequence[str | Objective]) -> ForceKind:
     """Return the kind of force that drivable cells limit.
 
-    It is the robust force if an objective minimises a robust force, else the planned force.
+    It is the robust force, which holds the box in every case of the uncertainty, if an objective
+    minimises a robust force. Otherwise it is the planned force, which holds the box if everything
+    is exactly as described.
 
     Raises:
         SettingsError: an objective is unknown or given twice, or none is given.

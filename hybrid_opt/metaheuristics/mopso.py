@@ -83,10 +83,9 @@ def thin(
 ) -> Indices:
     """Choose the members that stay if the archive is over capacity.
 
-    Members are removed from the fullest hypercubes until all of these have equally many. Newcomers
-    go before old members (the papers refuse a newcomer to a fullest hypercube), otherwise chance
-    decides. One sort does this: the members of each hypercube are stacked, and the lowest members
-    of all stacks stay.
+    Members are removed from the fullest hypercubes, until the hypercubes that lost members are
+    equally full. Within a hypercube newcomers are removed before old members; otherwise chance
+    decides.
 
     Args:
         cubes: (n,) hypercube number of each member.

@@ -167,11 +167,11 @@ class Evaluator(Protocol):
 
 
 def reject_non_finite(evaluations: Evaluations) -> Evaluations:
-    """Return the evaluations, with every candidate that has a NaN or infinite figure made
-    infeasible.
+    """Return the evaluations, with every candidate made infeasible that has a NaN or infinite
+    violation, penalised objective or, if it was feasible, objective.
 
-    Such a candidate gets `WORST_PENALTY` and the reason `NOT_FINITE`. Infeasible candidates may
-    have plain objectives that are not finite.
+    Such a candidate gets `WORST_PENALTY` and the reason `NOT_FINITE`. Objectives of a candidate
+    that was infeasible before may be NaN or infinite, since only its penalised objectives count.
     """
     finite = np.isfinite(evaluations.violation).all(axis=1)
     finite &= np.isfinite(evaluations.violation_time).all(axis=1)

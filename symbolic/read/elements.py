@@ -107,9 +107,8 @@ class ElementReader:
         return self.element.tag
 
     def at(self, key: str) -> str:
-        """Return the place of an attribute for messages: the place of the element, then the
-        attribute's name.
-        """
+        """Return the place of the attribute `key` in the document, for messages: the place of the
+        element, then the attribute's name."""
         return f"{self.path} {key}".lstrip()
 
     def named(self, tag: str) -> dict[str, ElementReader]:
@@ -205,12 +204,15 @@ class ElementReader:
         return float(self.numbers(key, (allowed,), default)[0])
 
     def numbers(self, key: str, allowed: Sequence[Range], default: str | None = None) -> Array:
-        """Read an attribute with numbers separated by spaces.
+        """Read an attribute with n numbers separated by spaces.
 
         Args:
             key: name of the attribute.
-            allowed: range of each number.
-            default: text for a missing attribute; None if it is required.
+            allowed: ranges of the n numbers.
+            default: text for a missing attribute; None if the attribute is required.
+
+        Returns:
+            Array (n,).
         """
         if key in self.element.attrib:
             self.kept.set(key, self.element.attrib[key])
@@ -220,7 +222,10 @@ class ElementReader:
         """Read the numbers between the element's tags, separated by spaces.
 
         Args:
-            allowed: range of each number.
+            allowed: ranges of the n numbers.
+
+        Returns:
+            Array (n,).
         """
         return self._numbers(self.path, self.element.text, allowed)
 

@@ -122,9 +122,14 @@ class _Writer:
         return ElementTree.tostring(self._root)
 
     def _joints(self, body: int, name: str) -> None:
-        """Write the joints between the body with index `body` and its parent as URDF joints.
+        """Write the joints between a body and its parent as URDF joints.
 
-        Each joint turns about its own point of the body. `name` is the name of the body's link.
+        In MJCF a body may have several joints, each with an anchor point of its own. They become a
+        chain of URDF joints with empty links between them.
+
+        Args:
+            body: index of the body.
+            name: name of the body's link in the URDF.
         """
         model, kinds = self._model, self._mujoco.mjtJoint
         parent = self._names[model.body_parentid[body]]
@@ -170,9 +175,10 @@ class _Writer:
         return element
 
     def _effort(self, joint: int) -> float:
-        """Return the largest effort of a joint [N m or N].
+        """Return the largest torque or force of a joint [N m or N].
 
-        This is the limit of the joint, else the limit of its motors, else 0.
+        This is the joint's own limit if it has one, else the sum of the limits of the actuators
+        that drive it; 0 if none is limited.
         """
         model, words = self._model, self._mujoco
         if model.jnt_actfrclimited[joint]:

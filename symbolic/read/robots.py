@@ -68,11 +68,12 @@ def read_robot(table: TableReader, folder: Path, stored: bool = False) -> tuple[
     Args:
         table: the arm's section of the workcell file.
         folder: folder to which paths in the section are relative.
-        stored: whether the cell was unpacked from an archive.
+        stored: True if the cell was unpacked from an archive.
 
     Returns:
-        The arm, and the index of the start branch: -1 for the best by the ranking, -2 if the file
-        says "search".
+        The arm, and the index of the start branch, the posture in which the arm holds the box at
+        the start. The index is -1 if the project ranks the postures and takes the best, -2 if the
+        file says "search".
     """
     name = table.text("name")
     if "/" in name:
@@ -151,7 +152,8 @@ UNKNOWN_TORQUE = "unknown"
 
 @cache
 def _warn_unjudged(robot: str) -> None:
-    """Warn once that the joint torques of the robot called `robot` are not limited."""
+    """Warn once that the file states no torque limits for the robot called `robot`, so that its
+    joint torques are not checked."""
     warnings.warn(
         f'robot {robot!r} has torque_max = "{UNKNOWN_TORQUE}": no carry, timing or job is judged '
         "by the torques of its joints, and tables show no use of them",
@@ -337,7 +339,8 @@ def _recorded(table: TableReader, key: str) -> Iterator[None]:
 
 
 def _read_named(table: TableReader) -> NamedRobot:
-    """Read the description of a robot given by name. Problems are recorded at the key 'robot'."""
+    """Return the files of the robot description that the key 'robot' names. Problems are recorded
+    at the key 'urdf'."""
     name = table.text("robot")
     if table.has("urdf"):
         table.add("urdf", "found beside 'robot'; give one of the two")

@@ -96,14 +96,15 @@ class SceneBuilder:
     names: set[str] = field(default_factory=lambda: {PAYLOAD_NAME})
 
     def add(self, name: str, shape: Shape | Capsule, pose: Array) -> None:
-        """Add a shape as a body; leave it out, with a report, if a workcell would refuse it.
+        """Add a shape as a body of the scene. If a workcell file may not contain it, leave it out
+        and report the reason.
 
         A capsule becomes a cylinder and two spheres.
 
         Args:
             name: name of the shape in the scene.
             shape: the shape.
-            pose: (4, 4) in the world.
+            pose: (4, 4) pose of the shape in the world.
         """
         if isinstance(shape, Capsule):
             self.add(name, Cylinder(shape.radius, shape.length), pose)
@@ -207,7 +208,8 @@ class SceneBuilder:
         self.notes.append(f"{safe_io.printable(name) or 'scene'}: {what}")
 
     def _name(self, name: str) -> str:
-        """Return a unique name without the characters that key paths and patterns use."""
+        """Return a unique name for a body, similar to `name`, in which '-' replaces the characters
+        that key paths and patterns of a workcell file use."""
         wanted = re.sub(r"[/.*?\[\]]+", "-", safe_io.printable(name)).strip() or "body"
         wanted = wanted[: MAX_NAME_LENGTH - 6].strip()
         free = (wanted if k == 1 else f"{wanted} {k}" for k in range(1, MOST_BODIES + 3))

@@ -184,11 +184,15 @@ class _Sdf:
     def _place(
         self, scope: _Scope, name: str, model: _Scope, placed: tuple[str, Array], by: ElementReader
     ) -> None:
-        """Add a model, called `name`, to the world or model `scope`.
+        """Place a model in a world or in another model.
 
         Args:
-            placed: name of a frame, and the pose (4, 4) of the model's placement frame in it.
-            by: the element that states the name of the model's placement frame.
+            scope: the world or model that contains the placed model.
+            name: name of the placed model.
+            model: the placed model.
+            placed: name of a frame in `scope`, and the pose (4, 4) of the model's placement frame
+                relative to it.
+            by: element that states which frame of the model is its placement frame.
         """
         base, pose = placed
         frame = by.raw("placement_frame") or by.inner_text("placement_frame")
@@ -223,9 +227,11 @@ class _Sdf:
             self._place(scope, wanted or name, inner, placed, by)
 
     def _pose(self, part: ElementReader) -> tuple[str, Array]:
-        """Read an element's pose (4, 4), and the name of the frame to which it is relative.
+        """Read an element's pose.
 
-        The name comes first; it is '' for the default frame.
+        Returns:
+            Name of the frame to which the pose is relative, '' for the default frame; and the pose
+            (4, 4) in that frame.
         """
         pose = part.child("pose")
         if pose is None:

@@ -370,8 +370,12 @@ def _single(kind: Any, marks: Sequence[Any], value: Any, path: str, problems: Pr
 
 
 def _stand_in(kind: Any, marks: Sequence[Any] = ()) -> Any:
-    """Return a valid placeholder for a wrong or missing value of the type `kind`; `marks` are
-    further annotations, such as a `Range`."""
+    """Return a valid placeholder for a wrong or missing value.
+
+    Args:
+        kind: type of the value.
+        marks: further annotations of the type, such as a `Range`.
+    """
     if get_origin(kind) is Annotated:
         kind, *marks = get_args(kind)
     for mark in marks:

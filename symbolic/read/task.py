@@ -346,7 +346,8 @@ def with_redundancy(
 def _choice(
     workcell: Workcell, i: int, entries: Sequence[RedundancyEntry], common: tuple[str, ...]
 ) -> tuple[PosturePath | None, tuple[str, ...]]:
-    """Choose the redundant joints of one arm.
+    """Choose the redundant joints of one arm: those beyond six, whose positions are decision
+    variables.
 
     Args:
         workcell: the workcell.
@@ -355,8 +356,9 @@ def _choice(
         common: names of joints that move both arms.
 
     Returns:
-        The arm's path along the hand-made trajectory; None if it is not needed, because the file
-        states all joints and positions. Then the names of the redundant joints.
+        The arm's joint path along the trajectory of `task.initial`, and the names of the redundant
+        joints. The path is None if it is not needed, because the file states all joints and
+        positions, or if none is found.
     """
     robot = workcell.robots[i]
     model = arm_model(robot)
@@ -478,8 +480,8 @@ class _Chain:
         self.middle = (self.low + self.high) / 2.0
 
     def jacobian(self, q: Array) -> Array:
-        """Compute the Jacobian (6, joints) of the flange at joints q (n,): linear rows first, root
-        axes."""
+        """Compute the Jacobian (6, joints) of the flange at joint positions q (joints,): three
+        linear rows, then three angular rows, along the axes of the robot's root."""
         J: Array = pin.computeFrameJacobian(
             self.model, self.data, q, self.flange, pin.LOCAL_WORLD_ALIGNED
         )
@@ -527,11 +529,12 @@ class _Chain:
 def posture_path(
     robot: Robot, contact: Contact, task: Task, held: Mapping[int, float]
 ) -> PosturePath | None:
-    """Compute a path of all joints of an arm along the hand-made trajectory, away from joint
-    limits.
+    """Compute the positions of all joints of an arm along the trajectory of `task.initial`, away
+    from joint limits and singular postures.
 
     Args:
-        robot, contact: the arm and its contact.
+        robot: the arm.
+        contact: the arm's contact with the box.
         task: the task, with or without redundant joints.
         held: positions of joints that do not move, by index [rad or m].
 
@@ -570,11 +573,14 @@ def posture_path(
 def best_conditioned(
     path: PosturePath | None, n_joints: int, forced: Sequence[int]
 ) -> tuple[int, ...]:
-    """Choose the redundant joints of an arm such that the other six joints are conditioned best.
+    """Choose the redundant joints of an arm such that the other six joints stay farthest from
+    singular postures.
+
+    The measure is the least singular value of their Jacobian along the path.
 
     Args:
-        path: path of the arm along the hand-made trajectory; None chooses the joints next to the
-            root.
+        path: joint path of the arm along the trajectory of `task.initial`; None chooses the joints
+            next to the root.
         n_joints: number of joints of the arm.
         forced: indices of joints that are redundant in any case.
 

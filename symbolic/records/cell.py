@@ -295,8 +295,11 @@ class Uncertainty:
 
     @property
     def apart(self) -> float:
-        """Largest displacement of the pads relative to each other along the faces [m]; zero if
-        `stiffness` turns the displacement into a force."""
+        """Largest displacement of the pads relative to each other along the faces,
+        `relative_position` [m].
+
+        It is zero if `stiffness` is known: the displacement then becomes a part of `opposed_force`.
+        """
         return 0.0 if self.stiffness else self.relative_position
 
     @property
@@ -420,8 +423,11 @@ class Handling:
 
     @property
     def speed_max(self) -> float:
-        """Largest speed of the box at which the pads move apart by at most `partner_stop` [m/s];
-        infinite without that limit."""
+        """Largest allowed speed of the box [m/s]; infinite if `partner_stop` is None.
+
+        At this speed the pads move apart by `partner_stop` if one arm stops on its own and the
+        other arm stops `PARTNER_TIME` later.
+        """
         return np.inf if self.partner_stop is None else self.partner_stop / PARTNER_TIME
 
 
@@ -446,7 +452,7 @@ class Reading:
 
 
 def reading_of(workcell: Any, files: str) -> Reading:
-    """Compute the digests of a workcell in its present state.
+    """Compute the digests that show later whether a workcell has changed since it was read.
 
     Args:
         workcell: the workcell.

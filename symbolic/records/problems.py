@@ -58,8 +58,8 @@ class Problems:
             self.uncounted += 1
 
     def clean(self, *prefixes: str) -> bool:
-        """Return True if no problem was found at any of the key paths `prefixes`, below one or
-        above one."""
+        """Return True if no problem was found at the values of the key paths `prefixes`: neither at
+        a path itself, nor at a key inside it, nor at a table that contains it."""
         return not any(
             _is_within(path, prefix) or _is_within(prefix, path)
             for path, _ in self.found
