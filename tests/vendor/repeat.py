@@ -172,7 +172,7 @@ def run_ros(bundle: Bundle, fault: Fault, moment: float, arm: int, folder: Path)
             live.back()
 
     found = ros.run(bundle.files, folder, *own, act=act)
-    skew = float(np.ptp(found.starts[:2])) if len(found.starts) > 1 else 0.0
+    skew = float(np.ptp(found.starts)) if len(found.starts) else 0.0
     return Ended(found.code, found.log, found.q, skew, 0.0)
 
 

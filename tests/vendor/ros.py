@@ -43,7 +43,7 @@ class Run:
         log: what it said.
         time: (n,) of the controllers [s].
         q, effort: (n, joints) of both arms.
-        starts: of all accepted goals [s].
+        starts: when each controller began with its first goal [s].
         switched: (m, 3) when the outputs of hands were switched [s], of which arm, and whether on.
     """
 

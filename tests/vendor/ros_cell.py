@@ -33,7 +33,12 @@ from rosgraph_msgs.msg import Clock
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from tests.hybrid_opt.extras.bundles.controlled import SUCCEEDED, ControlledCell, Controller
+from tests.hybrid_opt.extras.bundles.controlled import (
+    SUCCEEDED,
+    ControlledCell,
+    Controller,
+    seconds,
+)
 
 CYCLE = 0.01
 """Of controllers and topics [s]; those of robots are shorter."""
@@ -58,7 +63,7 @@ class RosCell(ControlledCell):
     """A cell whose programs come over ROS 2.
 
     Attributes:
-        starts: start of each accepted goal [s], with the arms that it drives.
+        starts: when each controller began with its first goal [s], by its action.
     """
 
     def __init__(self, node: Any, folder: Path, speed: float) -> None:
@@ -67,7 +72,7 @@ class RosCell(ControlledCell):
         self._longest, self._news = 0.0, deque[tuple[float, Any, Any]]()
         job = json.loads((folder / "job.json").read_text("utf-8"))
         super().__init__(job, json.loads((folder / "config/cell.json").read_text("utf-8")))
-        self.starts: list[float] = []
+        self.starts: dict[str, float] = {}
         self._servers = [self._server(action) for action in self.controllers]
         for name, kind in {
             c["name"]: c["kind"] for c in (*self.config["prepare"], *self.grips)
@@ -115,8 +120,9 @@ class RosCell(ControlledCell):
 
         def take(handle: Any) -> None:
             done = results[bytes(handle.goal_id.uuid)] = Future()
-            stamp = handle.request.trajectory.header.stamp
-            self.starts.append(stamp.sec + 1e-9 * stamp.nanosec)
+            # A goal that comes late begins late.
+            begin = max(seconds(handle.request.trajectory.header.stamp), self._now)
+            self.starts.setdefault(action, begin)
             controller.take(handle.request.trajectory, lambda *end: done.set_result(end))
             handle.execute()
 
@@ -140,8 +146,9 @@ class RosCell(ControlledCell):
         self.drive()
         sec, nanosec = divmod(round(self._now * 1e9), 10**9)
         stamp = Time(sec=sec, nanosec=nanosec)
-        if len(self.starts) >= len(self.controllers):
-            (self._folder / "new").write_text(str(self._now - self.starts[0]), "utf-8")
+        if len(self.starts) == len(self.controllers):
+            since = self._now - min(self.starts.values())
+            (self._folder / "new").write_text(str(since), "utf-8")
             (self._folder / "new").replace(self._folder / "clock")
         self._clock.publish(Clock(clock=stamp))
         for place, states in enumerate(self._states):
@@ -264,7 +271,7 @@ def main() -> None:
     executor.add_node(node)
     while not ends:
         executor.spin_once(timeout_sec=0.1)
-        if pending and cell.starts and cell.time() >= cell.starts[0] + pending[0][0]:
+        if pending and cell.starts and cell.time() >= min(cell.starts.values()) + pending[0][0]:
             cell.fault(*pending.pop()[1:])
     time, q, effort = (np.array(column) for column in zip(*cell.record, strict=True))
     np.savez(
@@ -272,7 +279,7 @@ def main() -> None:
         time=time,
         q=q,
         effort=effort,
-        starts=cell.starts,
+        starts=list(cell.starts.values()),
         switched=cell.switched,
     )
     rclpy.shutdown()

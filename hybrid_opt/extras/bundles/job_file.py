@@ -409,18 +409,21 @@ class Export:
         """Deviations from the plan at which the programs stop the job."""
         held = [phase.force for phase in self.job.held]
         spare = min(float(((f.normal - f.least) / f.normal).min()) for f in held)
-        k = self.stiffness
+        k, behind = self.stiffness, max(BEHIND, LAGS * self.lag)
         survived = LEAST_SKEW if k is None else largest_skew(self.job, k)
         return Limits(
             stop_time=self.stop.time,
             quick_stop=self.stop.quick,
             start=START,
             path=PATH,
-            behind=max(BEHIND, LAGS * self.lag),
+            behind=behind,
             skew=float(np.clip(survived, LEAST_SKEW, MOST_SKEW)),
             force=float(np.clip(spare, LEAST_BAND, MOST_BAND)),
             silence=SILENCE,
             grip=self.workcell.handling.grip_limit,
+            # An arm that stands is noticed where it is `behind`; one that has no link any more,
+            # where it is silent. Half of a stop's time passes at the planned speed.
+            partner_stop=max(behind, SILENCE) + REACTION + self.lag + self.stop.quick / 2.0,
         )
 
     @cached_property
@@ -430,10 +433,7 @@ class Export:
         Raises:
             JobError: the pads would move farther apart than the cell allows.
         """
-        # An arm that stands is noticed where it is `behind`, often sooner by what the arms are
-        # apart; half of a stop's time passes at the planned speed.
-        time = self.limits.behind + REACTION + self.lag + self.stop.quick / 2.0
-        job, k = self.job, self.stiffness
+        job, k, time = self.job, self.stiffness, self.limits.partner_stop
         survived = None if k is None else separation(job, largest_skew(job, k, time))
         allowed = self.workcell.handling.partner_stop
         found = PartnerStop(time, separation(job, time), survived, allowed)

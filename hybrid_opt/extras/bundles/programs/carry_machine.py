@@ -287,7 +287,8 @@ class Machine:
             raise Refused("the box stands: 'continue' lets go of it")
         if seen.fault:
             raise Refused(seen.fault)
-        self._require_places(seen, self.job.limits.path)
+        # An arm that has stopped by itself is behind by what the other one took to stop.
+        self._require_places(seen, self.job.limits.path, self.job.limits.partner_stop)
         self.state, self._strikes = "running", 0
         self._aim(direction)
         self.clock.turn(direction)
@@ -425,11 +426,12 @@ class Machine:
         if self.state == "landing":
             return f"the box stands in {where}: {self.reason}. Both arms let go of it there"
         if self.state in ("stopping", "held"):
-            known = (
-                f"{' and '.join(self._silent)} is silent: look whether it still holds"
-                if self._silent
-                else f"Both arms report and are commanded to hold their places and {self._keeps}"
-            )
+            known = f"Both arms report and are commanded to hold their places and {self._keeps}"
+            if self._silent:
+                look = "are silent: look whether they still hold"
+                if len(self._silent) == 1:
+                    look = "is silent: look whether it still holds"
+                known = f"{' and '.join(self._silent)} {look}"
             return (
                 f"{self.state} in {where}: {self.reason}. {known}. To set the box down: 'continue' "
                 "to the end of the job, or 'back' to where the box stood"
@@ -456,11 +458,23 @@ class Machine:
     def _name(self, arm: int) -> str:
         return str(self.job.robots[arm]["name"])
 
-    def _require_places(self, seen: Seen, most: float) -> None:
+    def _require_places(self, seen: Seen, most: float, way: float = 0.0) -> None:
+        """Check that both arms report and are where the job stands.
+
+        Args:
+            seen: measured state of both arms.
+            most: largest distance of a pad from its path [m].
+            way: planned time [s] by which an arm may be elsewhere along its path.
+
+        Raises:
+            Refused: an arm is silent or elsewhere.
+        """
+        s = self.clock.s
         for arm, q in enumerate(seen.q):
             if q is None or seen.age[arm] > self.job.limits.silence:
                 raise Refused(self._no_news(arm, seen))
-            away = self.job.distance(arm, q, self.clock.s)
+            at = self.job.coordinate(arm, q, s, (-way, way)) if way else s
+            away = self.job.distance(arm, q, at)
             if away > most:
                 raise Refused(
                     f"the pad of {self._name(arm)} is up to {1e3 * away:.1f} mm from its place, "

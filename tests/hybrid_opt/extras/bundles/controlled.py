@@ -88,9 +88,9 @@ class Controller:
 
         self._start, times = seconds(trajectory.header.stamp) or self.time(), times_of(points)
         known = [column(name) for name in ("positions", "velocities", "accelerations", "effort")]
-        if len(times) == 1:
-            # From where it is to a single point.
-            here = [self.desired, *np.zeros((2, len(self.q))), self.effort]
+        if self.time() - self._start < times[0]:
+            # trajectory.cpp `sample`: from where it is to the first point.
+            here = [self.desired, self.rate, np.zeros(len(self.q)), self.effort]
             known = [np.stack([first, *rows]) for first, rows in zip(here, known, strict=True)]
             times = np.array([self.time() - self._start, *times])
         self._times, self._rows = times, known[3]

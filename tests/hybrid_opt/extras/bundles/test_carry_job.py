@@ -192,10 +192,32 @@ def test_both_arms_are_compared_at_one_time() -> None:
     assert machine.state == "running", machine.status()
 
 
-def test_nothing_is_said_of_arms_that_are_silent() -> None:
+@pytest.mark.parametrize(("age", "told"), [(0.0, "right is "), (0.3, "left and right are ")])
+def test_nothing_is_said_of_arms_that_are_silent(age: float, told: str) -> None:
     machine = running(job().begin("carry") + 2.0)
-    ticks(machine, lambda s: Seen(posture(s), age=[0.0, 0.3]))
-    assert "right is silent" in machine.status()
+    ticks(machine, lambda s: Seen(posture(s), age=[age, 0.3]))
+    assert f" {told}silent" in machine.status()
+
+
+@pytest.mark.parametrize("stopped", [(True, False), (False, True), (True, True)])
+def test_arms_that_stopped_by_themselves_go_on_from_there(stopped: tuple[bool, bool]) -> None:
+    """They are behind by what the stop of the others took. One that is farther away has to be
+    moved first."""
+    s, way = job().begin("carry") + 2.0, job().limits.partner_stop
+
+    def seen(behind: float) -> Seen:
+        at = [s - behind if each else s for each in stopped]
+        return Seen([job().position(arm, each) for arm, each in enumerate(at)])
+
+    arm, machine = stopped.index(True), running(s)
+    machine.hold("asked")
+    q = seen(0.95 * way).q[arm]
+    assert q is not None
+    assert job().distance(arm, q, s) > 2.0 * job().limits.path
+    with pytest.raises(Refused, match=" mm"):
+        machine.resume(-1.0, seen(1.5 * way))
+    machine.resume(-1.0, seen(0.95 * way))
+    assert machine.state == "running"
 
 
 def test_one_strange_look_stops_nothing() -> None:
