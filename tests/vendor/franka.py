@@ -123,9 +123,9 @@ HANDLING = Handling(lift_height=0.02, set_down_height=0.02)
 """The carry begins and ends above the supports of the scene."""
 
 
-def bundle() -> tuple[Workcell, Contents]:
+def bundle(handling: Handling = HANDLING) -> tuple[Workcell, Contents]:
     """The cell of two Pandas called as FR3, whose links are as long, and its torque bundle."""
-    job = jobs_of("pandas").plan(timed("pandas"), handling=HANDLING)
+    job = jobs_of("pandas").plan(timed("pandas"), handling=handling)
     job = driven(job, replace(DRIVER, lag=0.0))
     names = tuple(tuple(n.replace("panda", "fr3") for n in own) for own in job.joint_names)
     job = replace(job, joint_names=(names[0], names[1]))

@@ -355,18 +355,17 @@ class Machine:
         limit = self.job.limits.silence
         self._silent = [self._name(arm) for arm, age in enumerate(seen.age) if age > limit]
         if self.state == "running":
+            wrong, force = self._wrong(seen), self._wrong_force(seen)
+            self._strikes = self._strikes + 1 if wrong or force else 0
             if not self.clock.turning and (
                 (self.clock.rate > 0.0 and self.clock.s >= self.job.end)
                 or (self.clock.rate < 0.0 and self.clock.s <= 0.0)
             ):
-                wrong = self._wrong(seen) or self._wrong_force(seen)
-                if wrong:
-                    self.hold(wrong)
-                else:
+                if self._strikes >= STRIKES:
+                    self.hold(wrong or force)
+                elif not self._strikes:
                     self.state = "done"
                 return
-            wrong, force = self._wrong(seen), self._wrong_force(seen)
-            self._strikes = self._strikes + 1 if wrong or force else 0
             if seen.fault or self._strikes >= STRIKES:
                 if not (seen.fault or wrong) and self.clock.rate > 0.0 and self._lands(force):
                     return

@@ -192,6 +192,15 @@ def test_both_arms_are_compared_at_one_time() -> None:
     assert machine.state == "running", machine.status()
 
 
+@pytest.mark.parametrize(("silent", "state"), [(1, "done"), (2, "done"), (10, "held")])
+def test_late_news_at_the_end_do_not_hold_the_job(silent: int, state: str) -> None:
+    machine = running(job().end - 2.5 * PERIOD)
+    ages = [0.0] * 2 + [0.3] * silent + [0.0] * 10
+    for age in ages:
+        machine.tick(PERIOD, Seen(posture(machine.clock.s), age=[age, 0.0]))
+    assert machine.state == state, machine.status()
+
+
 @pytest.mark.parametrize(("age", "told"), [(0.0, "right is "), (0.3, "left and right are ")])
 def test_nothing_is_said_of_arms_that_are_silent(age: float, told: str) -> None:
     machine = running(job().begin("carry") + 2.0)
