@@ -145,7 +145,7 @@ def sweep(
     Raises:
         SettingsError: the cell has another time law, the path does not fit it, there are no values,
             or the file is about something else.
-        WorkcellError: a key leads nowhere.
+        WorkcellError: the cell has no such key.
     """
     x = np.asarray(path.x if isinstance(path, Carry) else path, dtype=float)
     if not cell.workcell.task.law.is_drivable or x.shape != (cell.n_var,):
@@ -212,10 +212,10 @@ class _Chains:
         return [values for values in every if values not in self.done]
 
     def near(self, values: tuple[float, ...]) -> Array | None:
-        """Return the carry found for a combination that differs from a given one in the last key
-        only.
+        """Return the carry of a finished combination that is similar to a given one.
 
-        Of the finished combinations with an earlier value of this key, the nearest one is taken.
+        It differs in the value of the last key only. Of the values listed before the given one, the
+        last with a carry is taken.
 
         Args:
             values: values of the given combination, in the order of the keys.

@@ -125,8 +125,8 @@ class Lines:
     meaning: str
 
     def require(self, workcell: Workcell, target: str) -> None:
-        """Check that a target allows the names of outputs and inputs in the drivers of a cell. A
-        driver need not name an input.
+        """Check that a target allows the names of the digital outputs that switch the hands of a
+        cell, and of the inputs that report their state. An input may be left out.
 
         Args:
             workcell: the cell.
@@ -167,7 +167,8 @@ def plan_of(
         leads: for each arm, the part of its delay that the program compensates by sending commands
             ahead [s].
         stiffness: stiffness of each arm at its pad [N/m]; None if the job does not depend on it.
-        presses: True if the program can measure by a sensor how strongly a block is pressed.
+        presses: True if the bring-up program presses a block between the pads and measures the
+            force by the arms' sensors.
     """
     drivers = [vars(robot.driver).items() for robot in workcell.robots]
     return {
@@ -375,11 +376,11 @@ def _hold(joint: ElementTree.Element, position: float) -> None:
 
 
 def _add_fixed(root: ElementTree.Element, parent: str, name: str, bodies: Sequence[Body]) -> None:
-    """Add a link with bodies to a URDF, fixed to another link.
+    """Add a link with bodies to a URDF, by a fixed joint and with the frame of its parent link.
 
     Args:
         root: the URDF.
-        parent: name of the link to which the new one is fixed, in the same place.
+        parent: name of the parent link.
         name: name of the new link.
         bodies: the bodies, at their poses on the link.
     """

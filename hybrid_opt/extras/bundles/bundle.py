@@ -408,7 +408,8 @@ def prepared(job: Job, name: str, options: BundleOptions) -> Export:
     Raises:
         SettingsError: the step is out of range, no step keeps the force error small enough, or the
             target needs a stiffness that is unknown.
-        JobError: at no place of the path do the commanded forces hold the box in a stop.
+        JobError: stops of every tried duration need more than the commanded forces somewhere on
+            the path.
     """
     target, step, k = target_for(name, job.workcell), options.step, options.stiffness
     k = target.stiffness_of(job, name) if k is None else k

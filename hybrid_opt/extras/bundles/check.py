@@ -319,9 +319,9 @@ def check(
     Args:
         cell: the cell.
         trajectory: the trajectory.
-        held: first and last time at which the pads hold the box [s]; None for the carry that the
-            file states, or else the longest time in which the pads are at their planned places
-            relative to each other.
+        held: first and last time at which the pads hold the box [s]. None for the times that the
+            file states; if it states none, the longest run of samples at which the pads are near
+            their planned places relative to each other.
         interpolation: the controller's interpolation between samples; None for one that uses all
             known derivatives, as ROS 2's joint trajectory controller does.
 
@@ -395,8 +395,8 @@ def _load(cell: Cell) -> NumericFunction:
     """Return the compiled function that computes the contact forces from pose, velocity and
     acceleration of the box.
 
-    The function is loaded alone, because a timing model would also load its compiled solver of
-    timings.
+    A timing model has this function too, but would also load a compiled solver, which is not used
+    here.
 
     Args:
         cell: the cell.
@@ -459,8 +459,8 @@ def _held(along: Array, across: Array) -> Mask:
 
 
 def _poses(workcell: Workcell, q: Array) -> Array:
-    """Compute the box poses (n, 6) [m, rad] that follow from the place of the first arm's pad, in
-    the convention of the cell's task.
+    """Compute the box poses (n, 6) [m, rad] if the first arm's pad keeps its place on the box. The
+    last three numbers are angles or a rotation vector, as in the cell's task.
 
     Args:
         workcell: the cell.

@@ -91,7 +91,7 @@ RECORDED = (
 
 
 def recording(export: Export) -> dict[str, str | bytes]:
-    """Return the files of a ROS 2 recording of a job, whose times count from zero.
+    """Return the files of a ROS 2 recording of a job. Its time stamps begin at zero.
 
     Args:
         export: the job at the target's time steps.

@@ -362,8 +362,10 @@ class Export:
         return contact_torque(first, matrices, np.swapaxes(wrench, 0, 1))
 
     def _of_other(self, contact: Array) -> Array:
-        """Compute the joint torques that each arm's contact causes in the joints that move both
-        arms, and put them into the columns of the other arm.
+        """Exchange the torques of the two arms' contacts in joints that move both arms.
+
+        Such a joint, for instance a torso, has one column per arm. Each of its two columns gets the
+        torque that the other arm's contact causes in the joint.
 
         Args:
             contact: (n, joints) torques by each arm's own contact, both arms side by side [N m, for
@@ -397,7 +399,7 @@ class Export:
 
     @cached_property
     def gripped(self) -> Array:
-        """(n,) 1 at samples at which hands are switched on, else 0."""
+        """(n,) 1 at samples at which hands (cups, magnets, grippers) are switched on, else 0."""
         found = np.zeros(len(self.sampled.time))
         for index, phase in enumerate(self.job.phases):
             if phase.name in SWITCHES:

@@ -70,8 +70,9 @@ def stop_of(job: Job, model: TimingModel) -> Stop:
     places, x = time[::STOP_STRIDE], np.linspace(0.0, 1.0, INSTANTS)
 
     def stop(duration: float) -> Stop:
-        """Compute the largest shares of force and joint limits that are used in stops along the
-        path, which begin at many places.
+        """Simulate stops along the path that begin at many places of it. Return the largest normal
+        force and joint acceleration of all these stops, as shares of the commanded force and of the
+        limit.
 
         Args:
             duration: duration of each stop [s].

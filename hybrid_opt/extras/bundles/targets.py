@@ -132,8 +132,8 @@ class Target:
         return self.stated_stiffness(job.workcell, name)
 
     def stated_stiffness(self, workcell: Workcell, name: str) -> float | None:
-        """Return the stiffness of each arm at its pad that a cell states [N/m], averaged as in
-        `stiffness_of`; None if the target needs none.
+        """Return the stiffness of each arm at its pad that a cell states [N/m]: the mean
+        2 / (1 / k_1 + 1 / k_2) of both arms. None if one is not stated and the target needs none.
 
         Args:
             workcell: the cell.

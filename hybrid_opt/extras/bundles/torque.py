@@ -322,8 +322,8 @@ def joint_inertia(job: Job) -> Array:
 
 
 def _values(export: Export, arm: int) -> dict[str, Any]:
-    """Return the values that replace the placeholders of an arm's template, as far as all drivers
-    need them.
+    """Return the values that replace those placeholders of an arm's template that the drivers of
+    all makers have in common.
 
     Args:
         export: the job.

@@ -94,8 +94,8 @@ def base_choices(problem: Problem, spins: Array, rng: np.random.Generator) -> li
         rng: generator of random postures.
 
     Returns:
-        One dictionary per pair of bases: by name of the table of the problem file (robots and
-        contacts), the keys to add to it.
+        For each pair of bases the additions to the problem file that state it: new keys and values
+        by name of the table, `robots` or `contacts`.
     """
     found: list[tuple[float, dict[str, Any]]] = []
     for side in problem.sides():
@@ -107,7 +107,7 @@ def base_choices(problem: Problem, spins: Array, rng: np.random.Generator) -> li
 def _scored(
     problem: Problem, spins: Array, rng: np.random.Generator
 ) -> list[tuple[float, dict[str, Any]]]:
-    """Propose bases for both robots, with the contact points that the problem has now.
+    """Propose bases for both robots, with the places of the pads on the box kept fixed.
 
     Args:
         problem: the problem, with contacts.
@@ -115,8 +115,8 @@ def _scored(
         rng: generator of random postures.
 
     Returns:
-        For each proposal a score, of which a larger one is better, and the keys that put the bases
-        into the tables of the problem file.
+        For each proposal its score (larger is better), and the additions to the problem file that
+        state the bases: new keys and values by name of the table.
     """
     draft = draft_of(problem)
     scorer = PlaceScorer(problem, draft, spins, rng)
@@ -424,7 +424,7 @@ def shared_room(first: RankedBase, second: RankedBase) -> float:
         second: a base of the second robot.
 
     Returns:
-        `ROOMY` times this share.
+        The share times the weight `ROOMY`; larger is better.
     """
     both = first.follows & second.follows
     return ROOMY * float(both.mean()) if len(both) else 0.0

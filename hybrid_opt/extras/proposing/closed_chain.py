@@ -234,7 +234,7 @@ class ClosedChain:
         Args:
             begins: configuration at the beginning of each path.
             paths: (k, n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m];
-                neighbours are at most `PATH_STEP` apart.
+                the `distance` of neighbours is at most `PATH_STEP`.
 
         Returns:
             Configurations along each path, the one in `begins` first.

@@ -92,8 +92,8 @@ def rounded_outwards(bounds: Array, limits: Array) -> Array:
     """Round bounds to the decimals of a file: lower bounds down and upper bounds up, but not beyond
     limits.
 
-    A decimal times `RECIPROCAL_UNIT` may differ from its integer by rounding: 1e4 times 2.8065 is
-    28065.000000000004.
+    A bound that already has these decimals stays unchanged. Errors of floating-point products, such
+    as 1e4 times 2.8065 = 28065.000000000004, are removed before the bound is rounded.
 
     Args:
         bounds: (2, ...) lower and upper bounds [m, rad].

@@ -63,7 +63,8 @@ class Draft:
         return self.waypoints[1:-1, :POSE_SIZE]
 
     def around(self, centre: Array) -> Draft:
-        """Return this draft with its free waypoints replaced by those of a decision vector.
+        """Return this draft with its inner box poses and all redundant joints replaced by those of
+        a decision vector.
 
         Args:
             centre: (n_var,) decision vector [m, rad].
@@ -73,14 +74,15 @@ class Draft:
 
 
 def changes(problem: Problem, found: Draft) -> dict[str, Any]:
-    """Return what turns a problem file into a workcell file with a found path.
+    """Return the changes of a problem file that make it a workcell file with a found path.
 
     Args:
         problem: the problem.
         found: the path, with its cell.
 
     Returns:
-        New keys and values for the tables `task`, `robots` and `contacts`, by name of the table.
+        New keys and values by name of the table: of `task`, `robots` and `contacts`, of `handling`
+        if a stand-off is proposed, and those chosen before.
     """
     poses = readable_turns(found.waypoints[:, :POSE_SIZE], found.workcell.task.orientation)
     waypoints = np.hstack([poses, found.waypoints[:, POSE_SIZE:]])

@@ -47,9 +47,9 @@ Entry = dict[str, Any]
 
 
 def pattern_entry(entry: Entry, thickness: float) -> Entry:
-    """Return a contact's table, as in a file, with its hands placed relative to the first hand.
+    """Complete the table of a contact in a file by places and normals of its hands.
 
-    The first hand is at the origin with its z axis into the payload.
+    They are stated in the frame of the first hand, whose z axis points into the payload.
 
     Args:
         entry: table of the contact in the problem file, without `xyz`. The `xyz` of the hands in
@@ -129,8 +129,9 @@ def _with_tools_outside(cell: Workcell, pairs: Sequence[Both]) -> Iterator[Both]
     """Yield those pairs of contacts at which neither robot's tool enters the payload.
 
     Args:
-        cell: the cell; its own contacts only tell where each pad is on its arm.
-        pairs: contacts of both arms, one pair per place.
+        cell: cell with the robots, tools and payload. Its own contacts serve only to find the pose
+            of each pad in the frame of its arm's last joint.
+        pairs: contacts of both arms, one pair per tried place.
     """
     bodies, arms = collision_bodies(cell), [arm_geometry(cell, arm) for arm in (0, 1)]
     T_joint_pad = [

@@ -453,8 +453,8 @@ class _Finder:
         return arrived, path, self._score(path, room, measure)
 
     def _place_common(self, ends: Array) -> None:
-        """Overwrite positions at the goal of the redundant joints that also move the other arm,
-        with the positions given for them.
+        """Set the goal positions of those redundant joints that also move the other arm to the
+        positions that the query prescribes. Without prescribed positions nothing changes.
 
         Args:
             ends: (n, redundant) positions of the redundant joints at the goal [rad or m], changed

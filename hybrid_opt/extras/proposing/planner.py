@@ -262,7 +262,8 @@ def plan(
     def joined(first: State, second: State) -> bool:
         """Return True if the straight motion between two coordinates is free of collisions.
 
-        It is False if neither coordinate was reached before.
+        The arms are followed from the coordinate whose joint positions are known; those at the
+        other one are stored. If they are known at neither coordinate, the result is False.
 
         Args:
             first: (d,) coordinate in `room`.
@@ -293,13 +294,13 @@ def plan(
 def _usable(
     stops: list[ChainConfiguration], place: ChainConfiguration, room: AffineSubspace
 ) -> list[ChainConfiguration]:
-    """Select the configurations that lie in a region and not too near to one end of the carry.
+    """Select the configurations that lie in the searched set and are at least `SHORT_RETREAT` away
+    from an end of the carry.
 
     Args:
         stops: the configurations.
-        place: configuration at this end of the carry, the start or the goal; the least distance
-            from it is `SHORT_RETREAT`.
-        room: the region.
+        place: configuration at this end of the carry, the start or the goal.
+        room: the searched set.
 
     Returns:
         The selected configurations.

@@ -207,10 +207,11 @@ class Problem:
         """Return copies of the problem whose pads or hands are placed on different sides of the
         box.
 
-        There is one copy for each pair of opposite upright faces, for a machine with two arms also
-        one with exchanged arms. Hands are placed at the best of `hand_places`. If the file states
-        the places, or if a level carry past two robots determines the faces, only the problem
-        itself is returned.
+        Hands are placed at the best of `hand_places`, one copy for each. For pads there is one copy
+        for each pair of opposite upright faces; for a machine with two arms also one with exchanged
+        arms. Only the problem itself is returned if the file states the places, or if two separate
+        robots move the box so far horizontally that the direction of the carry determines the
+        faces.
         """
         entries = self.data["contacts"]
         start, goal = self.poses

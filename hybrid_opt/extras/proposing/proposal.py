@@ -427,8 +427,10 @@ class _Search:
     def _paths(
         self, setup: Setup, pair: Pair, effort: int, strays: int, box: PayloadSceneChecker
     ) -> Iterator[list[ChainConfiguration] | None]:
-        """Yield for each planner the corners of a collision-free path of the box, from start to
-        goal; None if it finds none.
+        """Yield the corners of collision-free paths of the box from start to goal.
+
+        With `effort` 0 these are paths of three straight motions. Otherwise a planner runs once for
+        each allowed deviation from the straight path; a run that finds no path yields None.
 
         Args:
             setup: the cell with its placed robots.
@@ -550,11 +552,12 @@ class _Search:
         return Trial(workcell, pair.start.q, bodies, named=False)
 
     def _pads_way(self, trial: Trial) -> tuple[str, float | None]:
-        """Find what blocks the pads before or after the carry of a trial.
+        """Find what blocks the pads' approach before a carry or their retreat after it. If the file
+        states no stand-off and the usual one is blocked, others are tried.
 
         Returns:
-            The obstacle as text, '' for none; and a free stand-off [m] if the cell's stand-off is
-            blocked and the file states none, else None.
+            The obstacle as text, '' for none; and another stand-off with which nothing blocks the
+            pads [m], None if there is none or none is needed.
         """
         handling = trial.workcell.handling
         blocked = grasp_blocked(trial, handling)

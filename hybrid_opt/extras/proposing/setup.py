@@ -141,8 +141,9 @@ def _free(judge: PoseJudge, *places: ChainConfiguration) -> bool:
 
 
 def _free_share(chain: ClosedChain, start: ChainConfiguration, goal: ChainConfiguration) -> float:
-    """Compute the share of a box path that both arms can follow without collision, from start and
-    goal together; the largest of all paths in `GUIDES`.
+    """Compute the share of a box path that both arms can follow without collision: the mean of the
+    shares forwards from the start and backwards from the goal. The largest of several paths in
+    `GUIDES` is returned.
 
     Args:
         chain: both arms, whose pads stay fixed on the box.

@@ -417,7 +417,8 @@ class Trial:
         return outputs["q_1"][0, 0], outputs["q_2"][0, 0]
 
     def verdict(self) -> tuple[Judgement, str]:
-        """Evaluate the proposed carry at its samples, between them, and at rest at both ends.
+        """Evaluate the proposed carry at its samples and between them, and check that the contacts
+        can hold the box at rest at start and goal.
 
         Returns:
             The verdict; and the reason if the carry is not feasible, else ''.

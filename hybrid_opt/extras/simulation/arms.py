@@ -116,15 +116,16 @@ class PressedBox(HeldBox):
         return np.bincount(pad, self._data.efc_force[address], 2).astype(float)
 
     def mend_contacts(self) -> None:
-        """Correct the contacts of this step for all accelerations. Call this method between the two
-        halves of a step.
+        """Add a neglected term to the reference accelerations of the contacts. This method has to
+        run between MuJoCo's `mj_step1` and `mj_step2`.
 
-        With contact Jacobian J and velocities v, MuJoCo takes J dv/dt as the acceleration of the
-        box relative to a pad and neglects dJ/dt v, some tenths of m/s^2 where arms swing. Without
-        this term contacts creep by millimetres per second and lift off.
+        With contact Jacobian J and joint velocities v, the box accelerates relative to a pad by
+        J dv/dt + dJ/dt v. MuJoCo neglects the second term, some tenths of m/s^2 where arms swing;
+        without it contacts creep by millimetres per second and lift off.
 
-        A step moves joints along arcs and the box along a line, which separates them by half of
-        dJ/dt v dt^2. The contacts' damping is set to compensate for it.
+        In a step of length dt the pads move along arcs, the box along a straight line. This
+        separates them by half of dJ/dt v dt^2; the added term is reduced so that the contacts'
+        damping compensates for it.
         """
         pad, is_first, address, axes = self._contacts()
         if not len(pad):
@@ -190,7 +191,8 @@ class CellSimulation:
                 acceleration of the motion, world frame [m/s^2].
 
         Raises:
-            SimulationError: MuJoCo is not installed, or torques are unknown.
+            SimulationError: MuJoCo is not installed, or a joint's largest torque is unknown.
+            SettingsError: the cell has hands that hold without a squeeze.
         """
         if not np.isfinite(workcell.stack_joint_limits("torque_max")).all():
             raise SimulationError(

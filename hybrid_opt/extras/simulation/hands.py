@@ -216,12 +216,14 @@ class HandSimulation:
 
 
 def own_forces(workcell: Workcell, forces: Array) -> Array:
-    """Compute the holding force of each robot's hands from the forces that would hold the payload
-    if both robots had the weaker hands.
+    """Scale the needed holding forces from the weaker hands of a cell to each robot's own hands.
+
+    The contact model states for each robot the force that hands as weak as the weaker ones of the
+    cell would need. It is multiplied by the robot's holding force over the lesser of both robots'.
 
     Args:
         workcell: the cell.
-        forces: (2,) holding forces as if both robots had the weaker hands [N].
+        forces: (2,) force for each robot, stated for the weaker hands [N].
 
     Returns:
         (2,) holding force of each robot's own hands [N].
@@ -353,8 +355,10 @@ def _displacement(workcell: Workcell, layer: float, opposed: ArrayLike) -> Array
 
 
 def lip_points(hand: Contact, points: int) -> Array:
-    """Compute points in the plane of a hand's patch at which the hand presses on the payload. The
-    mean of their squared coordinates equals the mean over the patch.
+    """Compute points in the plane of a hand's patch at which the hand presses on the payload.
+
+    The mean of x^2 and of y^2 over these points equals the mean over the patch, or over the rim of
+    a cup. So they transmit moments like the patch.
 
     Args:
         hand: the hand.

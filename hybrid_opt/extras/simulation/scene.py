@@ -279,8 +279,8 @@ def box_body(payload: Payload, geoms: str) -> str:
 
 
 def solver_options(settings: ContactSettings, gravity: Array, heaviest: float = 1.0) -> str:
-    """Return MuJoCo's options as MJCF: elliptic cones, solved to many digits, with hardly any
-    creep.
+    """Return MuJoCo's options as MJCF. They select elliptic friction cones, a small tolerance of
+    the solver, and a large `impratio`, which keeps frictional contacts from creeping.
 
     Args:
         settings: settings of the contacts.
@@ -552,7 +552,8 @@ def _ties(workcell: Workcell) -> Iterator[str]:
 
 
 def _arm(workcell: Workcell, settings: ArmSettings, i: int, shown: dict[Frame, list[str]]) -> str:
-    """Return the nested bodies of one arm as MJCF. The last one bears its pads.
+    """Return the links of one arm as nested bodies of MJCF. The body of the last joint bears the
+    arm's pads.
 
     Args:
         workcell: the cell.

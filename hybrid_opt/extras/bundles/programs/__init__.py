@@ -8,8 +8,8 @@ from string import Template
 
 
 def program(name: str) -> str:
-    """Return the text of a program that is copied into bundles, with imports changed to its folder
-    there.
+    """Return the text of a program as it stands in a bundle: it imports its neighbours in the same
+    folder by their plain names, not from this package.
 
     Args:
         name: file name of the program.
@@ -19,11 +19,11 @@ def program(name: str) -> str:
 
 
 def filled(name: str, **values: object) -> str:
-    """Return the text of a template file, in which each `$name` is replaced by the value of that
-    name.
+    """Return the text of a template file with its placeholders `$NAME` replaced by values.
 
     Args:
         name: path of the template.
+        values: value of each placeholder by its name.
 
     Raises:
         KeyError: a value is missing.

@@ -240,7 +240,9 @@ class Looks:
             lag: delay of the arm behind its commands [s].
 
         Returns:
-            Values of attributes of `Measured` by name: `sign`, and either `stiffness` or `press`.
+            A dictionary with `sign`, 1 or -1, the sign of the readings under pressure. If the
+            displacement of the pad is known, also with `stiffness`, of each arm at its pad [N/m];
+            otherwise with `press`, the measured force over the commanded one.
 
         Raises:
             Refused: no force was measured.

@@ -183,9 +183,9 @@ class Job:
     def stand(self, s: float, q: Sequence[Sequence[float] | None]) -> None:
         """Let the release begin at a place within the set-down, because the box stands already.
 
-        All later planned positions are shifted accordingly. While the commanded forces decrease,
-        the commanded positions of the arms move to the measured ones. So arms that give way under
-        force release the box as well.
+        From the release on, planned positions are shifted by the part of the set-down that is left
+        out. While the commanded forces decrease, the positions move to the measured ones: the box
+        displaces compliant arms from their commanded positions, which would go on pressing it.
 
         Args:
             s: planned time, within the set-down, at which the box stands [s].

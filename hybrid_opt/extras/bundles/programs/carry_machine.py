@@ -266,7 +266,7 @@ class Machine:
         """Hold the present commanded posture because the arms cannot continue.
 
         Args:
-            reason: reason, for the status.
+            reason: why the arms cannot continue, for `status`.
         """
         self.clock = Clock(self.job.end, self.job.limits.stop_time, self.clock.s)
         self.state, self.reason = "held", reason
@@ -384,17 +384,16 @@ class Machine:
                 self.hold(str(error))
 
     def _lands(self, force: str) -> bool:
-        """Decide whether a wrong force may mean that the box stands already, in the last part of
-        its set-down.
+        """Begin to stop the arms if a wrong force may mean that the box stands on its support.
 
-        If it may, the machine stops the arms there, unless the release begins before they would
-        stand.
+        That may be in the last part of the set-down. No stop begins if the release would begin
+        before the arms are at rest.
 
         Args:
-            force: reason why the measured forces are wrong.
+            force: text on the wrong force, for `status`.
 
         Returns:
-            True in the last part of the set-down.
+            True if the box may stand, whether or not a stop begins.
         """
         if not self.job.is_touching(self.clock.s):
             return False

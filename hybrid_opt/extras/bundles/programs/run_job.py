@@ -197,8 +197,8 @@ class Run:
         self.node.create_subscription(type_of(source["kind"]), source["topic"], heard, NEWEST)
 
     def _switch(self) -> None:
-        """Switch the hands as the job requires at its present place. A refusal is reported as a
-        fault when it arrives."""
+        """Call the ROS services that switch the hands, if their commanded state has changed. If a
+        service refuses, this is reported as a fault when its answer arrives."""
         if self.machine.grip == self._switched:
             return
         self._switched = self.machine.grip
@@ -281,8 +281,8 @@ class Run:
         Args:
             name: name of the service.
             kind: type of the service.
-            requests: fields of one request by name, once for each version of the driver; the first
-                that fits the service's type is sent.
+            requests: alternative requests for different versions of the driver, each as values of
+                its fields by name. The first that fits the service's type is sent.
 
         Raises:
             Refused: none of the requests fits.
@@ -315,7 +315,8 @@ class Run:
             raise Refused(f"{name} is not there; are the controllers launched?")
 
     def prepare(self) -> None:
-        """Check the arms, then call the services that config/cell.json lists, in this order.
+        """Check the arms, then call the services that config/cell.json lists under `prepare`, in
+        the order of the list.
 
         Raises:
             Refused: a service is missing or refuses, or an arm is not at its first position.
