@@ -86,8 +86,9 @@ class ConvexProgram(Protocol):
         parameter group. Compiled functions take these parameters after the inputs `cell_sizes`."""
 
     def free(self, wrenches: list[ca.SX]) -> ca.SX:
-        """Select the free components of the scaled wrenches of all contacts, as one column. The
-        load and the free components determine the others."""
+        """Select those components of the scaled wrenches of all contacts that the load does not
+        determine, as one column. The load and these free components determine the other
+        components."""
 
     def balanced(self, free: ca.SX, cell: list[ca.SX]) -> list[ca.SX]:
         """Compute the scaled wrench of each contact such that all contacts together balance the
@@ -99,9 +100,13 @@ class ConvexProgram(Protocol):
         contacts of convex terms of degree two at most. `cell` lists the convex program's inputs."""
 
     def start(self, cell: list[ca.SX]) -> tuple[list[ca.SX], ca.SX]:
-        """Return the start of the method for the inputs `cell`: the state (n,) of each patch,
-        within its cone and in balance with the load; and a scalar: barrier weight times the sum of
-        the patches' degrees, over the effort."""
+        """Compute the start of the interior-point method for the inputs `cell`.
+
+        Returns:
+            The state (n,) of each patch, inside its cone and in balance with the load; and a scalar
+            that sets the initial weight of the barriers: this weight times the sum of the patches'
+            degrees, over the effort.
+        """
 
     def __hash__(self) -> int:
         """Hash by identity: compiled functions are cached by program."""
@@ -128,13 +133,14 @@ class Patch(ABC):
 
     @abstractmethod
     def centred(self, state: ca.SX, weight: ca.SX) -> ca.SX:
-        """Return the iterate (iterate_size,) of a state (n,): the state, and the multipliers that
-        belong to it on the central path, which are -`weight` times the gradient of the barrier."""
+        """Build the iterate (iterate_size,) of a state (n,). It holds the state and the multipliers
+        that belong to the state on the central path: -`weight` times the gradient of the
+        barrier."""
 
     @abstractmethod
     def local(self, iterate: ca.SX) -> LocalPatch:
-        """Compute the derivatives of the barrier that a Newton step from an iterate (iterate_size,)
-        needs."""
+        """Compute the derivatives of the barrier at an iterate (iterate_size,), the state with its
+        multipliers, for a Newton step."""
 
     @abstractmethod
     def potential(self, state: ca.SX) -> ca.SX:
@@ -143,8 +149,9 @@ class Patch(ABC):
 
     @abstractmethod
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
-        """Compute -1 / t, where t > 0 is a step length, nearly the longest, with which `state` + t
-        `change`, both (n,), is still within the cone."""
+        """Compute -1 / t for a step length t > 0. The point `state` + t `change`, both (n,), still
+        lies inside the cone, and t is nearly the largest such length. The result is near zero if no
+        step leaves the cone."""
 
     @abstractmethod
     def slack(self, state: ca.SX) -> ca.SX:
@@ -203,13 +210,24 @@ class LocalPatch(Protocol):
     gap: ca.SX
 
     def pull(self, weight: ca.SX, correction: ca.SX) -> ca.SX:
-        """Compute the multipliers (n,) after a Newton step that leaves the state unchanged.
-        `weight` is the barrier's new weight, `correction` (correction_size,) the second-order
-        correction."""
+        """Compute the multipliers (n,) that a Newton step would give if it left the state
+        unchanged. A change of the state lowers them by `stiffness` times the change.
+
+        Args:
+            weight: weight of the barrier after the step.
+            correction: (correction_size,) second-order correction of the multipliers; zero in a
+                predictor step.
+        """
 
     def step(self, weight: ca.SX, correction: ca.SX, change: ca.SX) -> NewtonStep:
-        """Compute the Newton step in which the state changes by `change` (n,). `weight` is the
-        barrier's new weight, `correction` (correction_size,) the second-order correction."""
+        """Compute the Newton step of state and multipliers in which the state changes by `change`.
+
+        Args:
+            weight: weight of the barrier after the step.
+            correction: (correction_size,) second-order correction of the multipliers; zero in a
+                predictor step.
+            change: (n,) change of the state in a full step.
+        """
 
 
 # --- the method ---
@@ -238,8 +256,9 @@ def least_effort(program: ConvexProgram, *cell: ca.MX, differentiable: bool = Fa
 def central_path(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     """Build the function that solves a convex program by the interior-point method.
 
-    Inputs: the program's inputs, then its symbolic parameters. Output: one column, the iterates of
-    all patches, near the central path for barriers weighted by `final_weight` times the effort.
+    Inputs: the program's inputs, then its symbolic parameters. Output: one column with the iterates
+    of all patches, each a state with its multipliers. They are near the point of the central path
+    at which the weight of the barriers is `final_weight` times the effort.
     """
     cell = _mx_inputs(program)
     step = _step(program, final_weight)
@@ -251,9 +270,10 @@ def central_path(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> 
 def centred(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     """Build the function that solves a convex program and moves the solution onto the central path.
 
-    Inputs: the program's inputs, then its symbolic parameters. Output: one column, the states of
-    all patches, for barriers weighted by `final_weight` times the effort. CasADi takes its
-    derivatives as zero.
+    Inputs: the program's inputs, then its symbolic parameters. Output: one column with the states
+    of all patches, at the point of the central path at which the weight of the barriers is
+    `final_weight` times the effort. CasADi treats this output as constant: its derivatives are
+    zero.
     """
     cell = _mx_inputs(program)
     owns = ca.vertsplit(central_path(program, final_weight)(*cell), ends_of(program))
@@ -267,9 +287,17 @@ def centred(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Fu
 def _repeated(
     program: ConvexProgram, step: ca.Function, most: int, iterate: ca.MX, cell: list[ca.MX]
 ) -> ca.MX:
-    """Build the expression of the iterate after at most `most` steps from `iterate`, in blocks of
-    `BLOCK`. The function `step` also returns a flag, and 0 ends the steps. `cell` has the inputs
-    and symbolic parameters of the program."""
+    """Build the expression of the iterate after at most `most` steps. Steps after the last needed
+    one are skipped in blocks of `BLOCK`.
+
+    Args:
+        program: the convex program.
+        step: function of one step. It takes an iterate, a flag, and `cell`; it returns the next
+            iterate, and a flag that is 0 if no further step is needed.
+        most: largest number of steps, a multiple of `BLOCK`.
+        iterate: the first iterate, one column for all patches.
+        cell: the program's inputs, then its symbolic parameters.
+    """
     held = [ca.MX.sym("iterate", iterate.shape[0]), ca.MX.sym("goes_on")]
     inputs = [*held, *_mx_inputs(program)]
     keep = ca.Function("keep", inputs, held)
@@ -289,9 +317,10 @@ def _repeated(
 def _step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
     """Build the function of one step of the interior-point method.
 
-    Inputs: an iterate, an unused flag, the program's inputs and symbolic parameters. Outputs: the
-    next iterate, and a flag that is 1 if a further step is needed. The barrier's weight falls to
-    `final_weight` times the effort.
+    Inputs: the iterates of all patches, one column; a flag that is not read; the program's inputs
+    and symbolic parameters. Outputs: the next iterates, and a flag that is 1 if a further step is
+    needed. The step lowers the weight of the barriers, but not below `final_weight` times the
+    effort.
     """
     iterate, cell = ca.SX.sym("iterate", ends_of(program)[-1]), _sx_inputs(program)
     owns = zip(program.patches, ca.vertsplit(iterate, ends_of(program)), strict=True)
@@ -326,12 +355,13 @@ def _step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Func
 
 @lru_cache(PROGRAMS)
 def barrier_step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> ca.Function:
-    """Build the function of one Newton step of all patches' states towards the central path, at the
-    barrier weight `final_weight` times the effort.
+    """Build the function of one Newton step of all patches' states towards the point of the central
+    path at which the weight of the barriers is `final_weight` times the effort.
 
-    Inputs: the states, an unused flag, the program's inputs and symbolic parameters. Outputs: the
-    new states, and a flag that is 1 if a further step is needed. At states on the central path, the
-    derivatives of the new states by the inputs are those of the central path.
+    Inputs: the states, one column; a flag that is not read; the program's inputs and symbolic
+    parameters. Outputs: the new states, and a flag that is 1 if a further step is needed. At states
+    on the central path, the derivatives of the new states by the inputs are those of the central
+    path.
     """
     states, cell = ca.SX.sym("states", state_ends(program)[-1]), _sx_inputs(program)
     owns = ca.vertsplit(states, state_ends(program))
@@ -369,9 +399,10 @@ def central_point(
 
     Args:
         program: the convex program.
-        states: (n,) initial states of all patches, within the cones and in balance with the load.
+        states: (n,) initial states of all patches, inside the cones and in balance with the load.
         cell: values of the program's inputs; the first is the load (m,).
-        share: weight of the barriers, times the sum of the patches' degrees, over the effort.
+        share: relative weight of the barriers: the weight times the sum of the patches' degrees,
+            over the effort.
 
     Returns:
         States (n,) of all patches on the central path, and their derivatives (n, m) by the load.
@@ -390,9 +421,14 @@ def central_point(
 
 
 def _length(lowest: list[ca.SX], share: ca.SX | float) -> ca.SX:
-    """Compute the length, at most 1, of a Newton step. It is at most `share` times t of any patch.
-    t is the step length at which a state reaches its cone's boundary; `lowest` has -1 / t of each
-    patch."""
+    """Compute the length of a Newton step: `share` of the way to the first boundary of a cone, at
+    most 1.
+
+    Args:
+        lowest: for each patch -1 / t, where t is the step length at which the patch's state reaches
+            the boundary of its cone (`Patch.lowest`).
+        share: part of the smallest t that the step may go, at most 1.
+    """
     return ca.fmin(1.0, share / ca.fmax(-minimum(lowest), share))
 
 
@@ -522,32 +558,49 @@ class Equations:
         )
 
     def decrement(self, pulls: list[ca.SX], changes: list[ca.SX]) -> ca.SX:
-        """Compute the squared Newton decrement times the weight of the barriers, a scalar, from the
-        multipliers `pulls` (m,) and the change `changes` (m,) of the state of each patch."""
+        """Compute the squared Newton decrement times the weight of the barriers, a scalar. It
+        measures the distance from the central path.
+
+        Args:
+            pulls: multipliers (m,) of each patch, -weight times the gradient of its barrier.
+            changes: change (m,) of each patch's state in the Newton step.
+        """
         return ca.dot(ca.vertcat(*pulls) - self.slope, ca.vertcat(*changes))
 
     def changes(self, pulls: list[ca.SX]) -> list[ca.SX]:
         """Compute the change (m,) of each patch's state in a Newton step, after which the states
-        balance the load. `pulls` has the multipliers (m,) of each patch."""
+        balance the load.
+
+        Args:
+            pulls: multipliers (m,) of each patch, as `LocalPatch.pull` returns them.
+        """
         pull = ca.vertcat(*pulls) - self.slope - ca.mtimes(self._stiff, self.missing)
         found: list[ca.SX] = ca.vertsplit(self.missing + self.balanced_change(pull), self._ends)
         return found
 
     def constrained(self, moved: ca.SX) -> ca.SX:
-        """Compute the changes (n, k) of all states that follow from `moved` (n, k): k changes of
-        the components that the load determines, zero for other components. Those follow such that
-        effort plus barriers stay minimal."""
+        """Compute how the states on the central path change if the load changes.
+
+        Args:
+            moved: (n, k) for each of k changes of the load, the change of the components that the
+                load determines if the free components stay constant; zero for all other components.
+
+        Returns:
+            (n, k) changes of all states: `moved` plus those changes without effect on the load that
+            keep effort plus barriers minimal.
+        """
         pulls = ca.horzsplit(-ca.mtimes(self._stiff, moved))
         return moved + ca.horzcat(*map(self.balanced_change, pulls))
 
     def balanced_change(self, pull: ca.SX) -> ca.SX:
-        """Solve Newton's equations for a change of the states with which the load stays balanced.
+        """Solve Newton's equations for a change of the states that leaves the balance of the load
+        unchanged.
 
         Args:
             pull: (n,) right side of the equations, one number per entry of all patches' states.
 
         Returns:
-            Change (n,) of the states, the wrenches and further variables of all patches.
+            Change (n,) of the states of all patches.
         """
         reduced, found = self._first.forward(pull[self._order]), ca.SX(*pull.shape)
         left = self._last.forward(ca.mtimes(self._by_free.T, reduced[-len(self._wrench) :]))
@@ -586,7 +639,8 @@ def wrenches_of(program: ConvexProgram, owns: list[AnyExpression]) -> list[AnyEx
 
 
 def degree_of(program: ConvexProgram) -> float:
-    """Return the sum of the degrees of a convex program's patches."""
+    """Return the sum of the degrees of the barriers of a convex program's patches. A barrier of
+    degree d falls by d log t if the state is multiplied by t."""
     return sum(patch.degree for patch in program.patches)
 
 

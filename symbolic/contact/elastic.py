@@ -38,8 +38,8 @@ def layer_shares(pads: Sequence[Contact]) -> Array:
 
 
 def pressure_shifts(workcell: Workcell, load: Array, normal: Array) -> Array:
-    """Compute how far the centres of pressure shift, as a share of the shift at which the pressure
-    at a point of the rim vanishes.
+    """Compute how far the centres of pressure shift, relative to the shift at which a pad's rim
+    lifts off.
 
     Args:
         workcell: cell whose pads share each robot's normal force in proportion to their areas.
@@ -48,7 +48,7 @@ def pressure_shifts(workcell: Workcell, load: Array, normal: Array) -> Array:
         normal: (n, 2) normal forces of the robots [N].
 
     Returns:
-        (n, 2) largest share among each robot's pads. A rim lifts off if it exceeds 1.
+        (n, 2) largest ratio among each robot's pads. A rim lifts off if it exceeds 1.
     """
     pads, robots = workcell.pads, workcell.pad_robots
     area = np.array([pad.area for pad in pads])
@@ -66,14 +66,15 @@ def pressure_shifts(workcell: Workcell, load: Array, normal: Array) -> Array:
 
 
 def free_shift(pad: Contact) -> float:
-    """Compute the smallest shift of a pad's centre of pressure at which the pressure at a point of
-    the rim vanishes [m]."""
+    """Compute the smallest shift of a pad's centre of pressure along one of its axes at which the
+    rim lifts off [m]."""
     return float(min(kern(pad)))
 
 
 def kern(pad: Contact) -> tuple[Any, Any]:
-    """Compute the shifts of the centre of pressure along a pad's x and y axes at which the pressure
-    at a point of the rim vanishes [m]. They are symbols if the pad's lengths are symbols."""
+    """Compute the shifts of the centre of pressure [m] at which a pad's rim lifts off: first for a
+    shift along the pad's x axis alone, then along its y axis. They are symbols if the pad's lengths
+    are symbols."""
     if pad.half_sides is None:
         share = 2.0 if pad.is_ring else 4.0
         return pad.patch_radius / share, pad.patch_radius / share

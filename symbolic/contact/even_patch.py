@@ -70,14 +70,14 @@ class EvenPatch(Patch):
         return LocalEven(self, iterate)
 
     def potential(self, state: ca.SX) -> ca.SX:
-        """Compute the barrier -log(f^2 - M^2) at a state (4,), with the largest torsion f and the
-        torsion M of the state."""
+        """Compute the barrier -log(f^2 - M^2) at a state (4,). M is the torsion of the state, and f
+        the largest torsion that the patch bears beside the state's tangential force."""
         grip = ca.sqrt(self._grip_squared(state))
         return -ca.log(torsion_capacity(grip, state[1:3], self.shape)[0] ** 2 - state[3] ** 2)
 
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
-        """Compute -1 / t for a step length t > 0 with which `state` + t `change`, both (4,), is
-        still within the cone. t is nearly the longest such length."""
+        """Compute -1 / t for a step length t > 0. The point `state` + t `change`, both (4,), still
+        lies inside the cone, and t is nearly the largest such length."""
         # The friction limit: the lower eigenvalue of (N, T).
         square = self._grip_squared(state)
         mean = (state[0] * change[0] - ca.dot(state[1:3], change[1:3])) / square
@@ -93,11 +93,12 @@ class EvenPatch(Patch):
         return -1.0 / ca.fmax(near, LEAST_LENGTH)
 
     def slack(self, state: ca.SX) -> ca.SX:
-        """Compute the margin of a state (4,) to sliding, scaled like the state; it is negative if
-        the patch slides.
+        """Compute the margin of a state (4,) against sliding, in the units of the state: positive
+        while the patch holds, negative if it slides.
 
         If friction bears the tangential force, the margin is the largest torsion beside this force
-        minus the torsion of the state. Otherwise it is minus the missing friction.
+        minus the absolute torsion of the state. Otherwise it is the normal force minus the
+        tangential force over the friction coefficient.
         """
         grip = ca.sqrt(ca.fmax(self._grip_squared(state), 0.0))
         torsion = torsion_capacity(grip, state[1:3], self.shape)[0] - ca.fabs(state[3])
@@ -120,14 +121,15 @@ class LocalEven:
     """
 
     def __init__(self, patch: EvenPatch, iterate: ca.SX) -> None:
-        """Compute the barrier's derivatives at an iterate, and the weight that steps use.
+        """Compute the barrier's derivatives at an iterate, and the attributes `weight` and `trust`.
 
-        The weight that steps use is the weight of the iterate or, if larger, the scalar product of
-        state and multipliers over `DEGREE`.
+        `weight` is the weight in the iterate or, if larger, x . z / `DEGREE` with state x and
+        multipliers z. `trust` falls from 1 to `LEAST_TRUST` as z departs from its value on the
+        central path.
 
         Args:
             patch: the patch.
-            iterate: (9,) state, multipliers and weight.
+            iterate: (9,) state (4,), multipliers (4,) and weight.
         """
         self.patch = patch
         self.state, self.multiplier, weight = ca.vertsplit(
@@ -145,21 +147,27 @@ class LocalEven:
         self.trust = ca.fmin(ca.fmax(near, LEAST_TRUST), 1.0)
 
     def pull(self, weight: ca.SX, correction: ca.SX) -> ca.SX:
-        """Compute the multipliers (4,) after a Newton step that leaves the state unchanged.
+        """Compute the multipliers (4,) that a Newton step would give if it left the state
+        unchanged.
 
         Args:
             weight: weight of the barrier after the step.
-            correction: (4,) second-order correction.
+            correction: (4,) second-order correction of the multipliers; zero in a predictor step.
         """
         return -weight * self.slope - correction
 
     def step(self, weight: ca.SX, correction: ca.SX, change: ca.SX) -> NewtonStep:
-        """Compute the Newton step that belongs to a change of the state.
+        """Compute the Newton step of an iterate (state, multipliers, weight) in which the state
+        changes by `change`.
 
         Args:
-            weight: weight of the barrier after the step.
-            correction: (4,) second-order correction.
-            change: (4,) change of the state.
+            weight: weight of the barrier after a full step.
+            correction: (4,) second-order correction of the multipliers; zero in a predictor step.
+            change: (4,) change of the state in a full step.
+
+        Returns:
+            Change (9,) of the iterate in a full step, limits of the step length, and functions for
+            the correction and the gap after a step (`NewtonStep`).
         """
         lowest, grown = self.patch.lowest(self.state, change), weight - self.stored
         of_state = lowest / self.trust

@@ -88,11 +88,15 @@ class InternalForce:
 
 
 def closing_squeeze(workcell: Workcell) -> InternalForce | None:
-    """Find an internal squeeze of a workcell's pads; None if there is none at the share
-    `SPARE_FRICTION` of the friction coefficients.
+    """Find an internal squeeze of a workcell's pads: forces of the pads, inside their friction
+    cones, that balance one another.
 
-    The squeeze is computed for a lower friction: the geometric mean of this share and the least
-    share for which a squeeze exists.
+    For a margin to sliding, the squeeze is computed with less friction than the pads have. The
+    factor on the friction coefficients is the geometric mean of `SPARE_FRICTION` and of the
+    smallest factor with which a squeeze exists.
+
+    Returns:
+        The squeeze; None if there is none with the factor `SPARE_FRICTION`.
     """
     if _balanced_states(workcell, SPARE_FRICTION) is None:
         return None
@@ -113,17 +117,17 @@ def closing_squeeze(workcell: Workcell) -> InternalForce | None:
 
 def has_force_closure(workcell: Workcell) -> bool:
     """Return True if a workcell's pads can hold the payload under every motion, provided they press
-    strongly enough."""
+    strongly enough. Only `SPARE_FRICTION` of their friction counts."""
     return _balanced_states(workcell, SPARE_FRICTION) is not None
 
 
 def equal_pressure_rows(workcell: Workcell) -> Array:
-    """Return the conditions for equal pressure as a matrix (k, pads), whose product with the pads'
-    normal forces is zero.
+    """Return a matrix (k, pads) whose product with the pads' normal forces is zero if those pads
+    press with equal pressure that have to.
 
-    Each row states that two pads press with equal pressure. These are pads of one arm with the same
-    normal, because the arm keeps the orientation of their common plane. Pads with different normals
-    press as the motion requires.
+    These are pads of one arm with the same normal, because the arm keeps the orientation of their
+    common plane. Each of the k rows compares two of them. Pads with different normals have no row:
+    they press as the motion requires.
     """
     pads, robots, rows = workcell.pads, workcell.pad_robots, []
     for k in range(1, len(pads)):
@@ -137,11 +141,11 @@ def equal_pressure_rows(workcell: Workcell) -> Array:
 
 
 def balance_maps(workcell: Workcell, in_units: bool = False) -> list[Array]:
-    """Return one matrix (6 + k, 4) per pad that maps the pad's state to its part in the balance of
-    the load.
+    """Return one matrix (6 + k, 4) per pad that maps the pad's state to its terms in the equations
+    of balance.
 
-    The first six rows are force and moment about the box frame's origin along the box's axes; the
-    other k rows belong to the conditions of `equal_pressure_rows`.
+    The first six rows give the pad's force and moment about the box frame's origin, along the box's
+    axes. The other k rows give its terms in the k conditions of `equal_pressure_rows`.
 
     Args:
         workcell: cell with the pads.
@@ -243,7 +247,7 @@ def scaled_patch(contact: Contact) -> SoftPatch:
 
 def _generators(contact: Contact) -> Array:
     """Return n scaled states (n, 4) on the boundary of a patch's friction cone, all with normal
-    force 1. Their sums with positive weights approximate the cone."""
+    force 1. Their sums with positive weights fill nearly the whole cone."""
     patch, rows = scaled_patch(contact), []
     for angle in 2.0 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
         for share in np.linspace(0.0, 1.0, TORSIONS + 1)[:-1]:
@@ -302,7 +306,7 @@ def derive_grasp_numbers(workcell: Workcell, reach: float = 1.0) -> GraspNumbers
     Args:
         workcell: cell with the pads.
         reach: factor, at most 1, on the sizes of the patches for which the internal squeeze is
-            chosen. A smaller factor keeps its pressure away from the rims.
+            computed. With a smaller factor the squeeze leaves the patches more torsion in reserve.
 
     Raises:
         SettingsError: no internal squeeze exists.
@@ -391,12 +395,13 @@ def smaller_patches(workcell: Workcell, share: float) -> Workcell:
 
 
 def robot_wrenches(workcell: Workcell) -> Array:
-    """Return the matrix (6, 6 k) that maps the wrenches of all k pads to the sum of their forces
-    and moments along the axes of contact 1.
+    """Return a matrix (6, 6 k) that maps the wrenches of k pads to force [N] and moment [N m] along
+    the axes of contact 1.
 
-    Each pad's moment is taken about the nominal contact point of the pad's own robot. A pad's
-    wrench holds, along the pad's axes, normal force, tangential force (2,), the normal force times
-    the shift (2,) of the centre of pressure, and torsion.
+    Six columns belong to each pad. They take its moment about the nominal contact point of the
+    pad's own robot, so that the columns of one robot's pads together give this robot's wrench. A
+    pad's wrench holds, along the pad's axes, normal force, tangential force (2,), the normal force
+    times the shift (2,) of the centre of pressure, and torsion.
     """
     axes, columns = workcell.contacts[0].T_box_pad[:3, :3], []
     for pad, robot in zip(workcell.pads, workcell.pad_robots, strict=True):

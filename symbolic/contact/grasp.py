@@ -165,17 +165,19 @@ class Grasp:
     def start(self, cell: list[ca.SX]) -> tuple[list[ca.SX], ca.SX]:
         """Compute the start of the interior-point method.
 
-        For a load similar to the load at rest, the states are the first-order prediction of the
-        central path from its point at rest. Otherwise they are the least-norm states. In both cases
-        internal squeeze is added until the states lie within the cones.
+        For a load similar to the load at rest, the states are predicted to first order from the
+        stored point of the central path at rest. Otherwise they are the states of least norm that
+        balance the load. In both cases internal squeeze is added until the states lie inside the
+        cones.
 
         Args:
             cell: inputs of the program: load (6,) divided by its size, friction (2,), and relative
                 patch sizes (2,) if the program has this input.
 
         Returns:
-            State (4,) of each pad, in balance with the load; and the weight of the barriers, times
-            the sum of the patches' degrees, over the effort.
+            State (4,) of each pad, in balance with the load; and a scalar that sets the initial
+            weight of the barriers: this weight times the sum of the patches' degrees, over the
+            effort.
         """
         load, *sizes = cell[: 1 + len(SCALING_INPUTS)]
         given, rest = self.squeeze_states(*sizes), ca.SX(number(self.numbers.load_at_rest))
@@ -219,9 +221,11 @@ class Grasp:
         return ca.SX(number(numbers.rest)), ca.SX(number(numbers.rest_slopes))
 
     def complete(self) -> GraspNumbers:
-        """Return the constants together with the pads' states for the payload at rest.
+        """Compute how the pads hold the payload at rest, and return `numbers` with the results in
+        the fields `rest` and `rest_slopes`.
 
-        These are the fields `rest` and `rest_slopes`. The grasp must have no symbolic parameters.
+        `rest` (n,) holds the scaled states of all pads on the central path, `rest_slopes` (n, 6)
+        their derivatives by the load. The grasp must have no symbolic parameters.
         """
         inputs = [self.numbers.load_at_rest, *map(np.array, self._nominal())]
         load, *sizes = [ca.SX(ca.DM(value)) for value in inputs][: 1 + len(SCALING_INPUTS)]
@@ -231,8 +235,8 @@ class Grasp:
         return replace(self.numbers, rest=rest, rest_slopes=slopes)
 
     def _nominal(self) -> tuple[list[float], ...]:
-        """Return the workcell's own values of all inputs of the convex program except the load:
-        friction (2,)."""
+        """Return the workcell's own values of all inputs of the convex program except the load.
+        Here this is one list, the friction coefficients (2,)."""
         return (np.array(ca.evalf(self.friction)).ravel().tolist(),)
 
     def least_states(self, load: ca.SX, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
@@ -247,9 +251,11 @@ class Grasp:
         return self._at(ca.mtimes(number(self.numbers.spread), load), friction, reach)
 
     def squeeze_states(self, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:
-        """Return the internal squeeze of `numbers` as one state (4,) per pad, scaled by the given
-        friction and patch sizes. The states may lie outside the cones if friction is far below its
-        nominal value.
+        """Return the internal squeeze, pad forces that balance one another, as one scaled state
+        (4,) per pad. The normal forces of all pads sum to one.
+
+        The states are scaled by the given friction and patch sizes. They may lie outside the cones
+        if friction is far below its nominal value.
 
         Args:
             friction: (2,) friction coefficients of the robots' pads.
@@ -316,8 +322,8 @@ class Grasp:
     def result(
         self, wrenches: list[ca.SX], sizes: list[ca.SX]
     ) -> tuple[ca.SX, ca.SX | ca.DM | float]:
-        """Convert scaled wrenches to wrenches. The load has been divided by its size, so these are
-        wrenches over the size of the load.
+        """Convert the scaled wrenches of a solution to wrenches. `solve` has divided the load by
+        its size, so these are wrenches over the size of the load.
 
         Args:
             wrenches: scaled wrench (4,) of each pad.
@@ -325,8 +331,8 @@ class Grasp:
                 sizes (2,) if the convex program has this input.
 
         Returns:
-            Wrenches (6 k,) of all k pads; and the values (6 k,) that replace them if friction does
-            not close the grasp.
+            Wrenches (6 k,) of all k pads; and the values (6 k,), beyond every limit, that replace
+            them if friction does not close the grasp.
         """
         whole = [full_wrench(self.units(i, *sizes) * own) for i, own in enumerate(wrenches)]
         beyond = ca.DM([BEYOND, 0, 0, 0, 0, 0])

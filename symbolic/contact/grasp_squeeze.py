@@ -45,8 +45,10 @@ class GraspSqueeze(Grasp):
     """
 
     def __init__(self, workcell: Workcell, commanded: int) -> None:
-        """Find the internal squeeze, within the smallest relative patch size of `REACHES` that
-        closes the grasp.
+        """Take the constants of the grasp, or derive them from the cell.
+
+        The internal squeeze is derived for small patches: the smallest of the relative sizes
+        `REACHES` with which friction closes the grasp, or else the full size.
 
         Args:
             workcell: cell with the pads.
@@ -78,9 +80,8 @@ class GraspSqueeze(Grasp):
         with every pad displaced along its tangents.
 
         A scaled wrench holds normal force, tangential force (2,) over the friction coefficient, and
-        torsion over friction coefficient times patch radius. The displacement changes the moments
-        of the forces. `DISPLACED` fixed-point iterations find forces that balance these moments
-        too.
+        torsion over friction coefficient times patch radius. A displacement changes the moment of a
+        pad's force. `DISPLACED` fixed-point iterations find forces that also balance these changes.
 
         Args:
             free: (free_size,) components of the scaled wrenches that the load does not determine.
@@ -129,16 +130,16 @@ class GraspSqueeze(Grasp):
         return total
 
     def result(self, wrenches: list[ca.SX], sizes: list[ca.SX]) -> tuple[ca.SX, ca.SX | float]:
-        """Convert scaled wrenches to the normal forces of the robots. The load has been divided by
-        its size, so these are forces over the size of the load.
+        """Convert the scaled wrenches of a solution to the normal forces of the robots. `solve` has
+        divided the load by its size, so these are forces over the size of the load.
 
         Args:
             wrenches: scaled wrench (4,) of each pad.
             sizes: friction coefficients (2,) and relative patch sizes (2,); not used.
 
         Returns:
-            Normal force (2,) of each robot, and the number that replaces it if there is no
-            solution.
+            Sum (2,) of the normal forces of each robot's pads; and the number, beyond every limit,
+            that replaces both sums if friction does not close the grasp.
         """
         force = [ca.SX(0.0), ca.SX(0.0)]
         for own, robot in zip(wrenches, self.robots, strict=True):
@@ -157,8 +158,8 @@ def commanded_forces(
     differentiable: bool = False,
 ) -> ca.MX:
     """Build the expression of the robots' normal forces (2,) [N]: the least commanded force of one
-    robot, which is convex in the load, and the resulting force of the other. Both exceed any limit
-    if friction does not close the grasp.
+    robot, which is convex in the load, and the force of the other robot that results. Both exceed
+    any limit if friction does not close the grasp.
 
     Args:
         squeeze: convex program, which knows the commanded robot.
@@ -167,7 +168,8 @@ def commanded_forces(
         share: (2,) sizes of the robots' patches over the cell's own sizes.
         displacement: (4,) displacements of the first, then of the second robot's pads along their
             tangents [m].
-        handed: symbolic parameters of the convex program by group.
+        handed: MX vectors in place of the convex program's symbolic parameters, by group; None if
+            it has none.
         differentiable: True for exact first derivatives.
     """
     handed = handed or {}
@@ -214,12 +216,12 @@ def commanded_slack(
 
 
 def internal_force_gain(squeeze: GraspSqueeze) -> ca.Function:
-    """Build the function of the rise of the commanded force that bears a push of the arms against
-    each other, in newtons per newton.
+    """Build the function of the commanded force that a push of the arms against each other requires
+    in addition, in newtons per newton of the push.
 
-    The push is a tangential force at any of the pads; the friction of the additional squeeze bears
-    it. Inputs: friction coefficients (2,) and relative patch sizes (2,) of the robots, then the
-    symbolic parameters. Output: the rise, a scalar.
+    The push is a tangential force at any one of the pads. Friction has to bear it, so the pads
+    press harder. Inputs: friction coefficients (2,) and relative patch sizes (2,) of the robots,
+    then the symbolic parameters. Output: the additional commanded force over the push, a scalar.
     """
     friction, share = ca.SX.sym("friction", 2), ca.SX.sym("share", 2)
     given = squeeze.squeeze_states(friction, share / squeeze.numbers.reach)

@@ -123,14 +123,15 @@ def _length(*components: Expression) -> Expression:
 
 
 def internal_force_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Array:
-    """Compute the additional holding force of each hand per newton with which the arms push against
-    each other.
+    """Compute how much more holding force each hand needs if the arms push against each other, per
+    newton of the push.
 
     The push results from an error of the arms' relative pose; the elastic layers of the two arms
-    are springs in series. Let f be the unit vector of the push, n . f the normal force that it adds
-    at a hand, and g(f) its tilting or its sliding over the friction coefficient, as a force. The
-    hand then needs g(f) - n . f more. The square of this is at most max(g)^2 + 2 g(n) + n . n for
-    any direction f.
+    are springs in series. Consider a push of 1 N along the unit vector f. At a hand it adds the
+    normal force n . f. It also adds g(f): the tilting moment over the kern, or the sliding load
+    over the friction coefficient, as in the conditions (1) and (2) of the module. The hand then
+    needs g(f) - n . f more. The square of this is at most max(g)^2 + 2 g(n) + n . n for any
+    direction f.
 
     Args:
         pads: the n hands of both arms.
@@ -205,8 +206,9 @@ class HoldingHands(ContactModel):
 
     @property
     def pad_parameters(self) -> list[dict[str, Any]]:
-        """One dictionary per hand: its matrix (6, 6) of `layer_shares`, its row (4,) of
-        `internal_force_needs`, and the least holding force of all hands over the hand's own."""
+        """One dictionary per hand: 'share', its matrix (6, 6) of `layer_shares`; 'opposed', its row
+        (4,) of `internal_force_needs`; 'weaker', the holding force of the weakest hand over the
+        hand's own."""
         pads = self.workcell.pads
         if isinstance(pads[0], NumberedContact):
             return [{name: getattr(pad, name) for name in HAND_PARAMETERS} for pad in pads]
@@ -331,11 +333,12 @@ class HoldingHands(ContactModel):
     def commanded_forces(
         self, normal: Expression, friction: Expression, tracking: Expression, opposed: Expression
     ) -> Expression:
-        """Compute the holding force [N] that the hands of both arms need, stated for the hand with
-        the least holding force, as two equal entries (2,).
+        """Compute the holding force [N] that the hands of both arms need, as two equal entries
+        (2,). The force is stated for the weakest hand; a stronger hand holds with more, in
+        proportion to its own holding force.
 
         Args:
-            normal: (2,) least holding force of each arm's hands [N].
+            normal: (2,) least holding force of each arm's hands, stated for the weakest hand [N].
             friction: (2,) Coulomb coefficients of the arms' hands.
             tracking: (2,) share of each arm's holding force that may be missing, for example of a
                 vacuum.
@@ -361,15 +364,15 @@ class HoldingHands(ContactModel):
         return np.asarray(way / np.linalg.norm(way))
 
     def held_with(self, commanded: Array) -> Array:
-        """Return the least holding force of all hands [N], repeated to the shape (n, 2) of
-        `commanded`. It does not depend on commanded forces."""
+        """Return the holding force of the weakest hand [N], repeated to the shape (n, 2) of
+        `commanded`. Hands hold by their own force, so the values of `commanded` are not used."""
         weakest = min(contact.holding_force for contact in self.workcell.contacts)
         return np.full(commanded.shape, weakest)
 
     def raised(self, planned: Array, extra: Array, leader: int) -> Array:
-        """Compute the holding forces (n, 2) [N] after a rise. Both columns are the raised force of
-        the robot that does not lead, because the hands of both arms hold with the same share of
-        their holding forces.
+        """Compute the holding forces (n, 2) [N] after a rise of the force of the robot that does
+        not lead. Both columns equal this robot's raised force, because the hands of both arms hold
+        with the same share of their holding forces.
 
         Args:
             planned: (n, 2) planned holding forces [N].

@@ -155,8 +155,8 @@ class ContactModel(ABC):
 
     @property
     def has_scalar_squeeze(self) -> bool:
-        """True if the normal force of one pad determines the normal force of the other. The least
-        squeeze, one number, then suffices for a worst case."""
+        """True if the normal force of one pad determines the normal force of the other. One number,
+        the least squeeze, then states what a case of the uncertainty requires."""
         return self.has_closed_form
 
     @property
@@ -205,13 +205,15 @@ class ContactModel(ABC):
 
     @property
     def force_branches(self) -> Array:
-        """Coefficients (2, b, 2) of b linear functions for each contact; the largest of them is the
-        contact's normal force. The functions depend on the two `force_quantities`."""
+        """Coefficients (2, b, 2): for each contact, b linear functions of the two
+        `force_quantities`. The largest value of these functions is the contact's normal force
+        [N]."""
         return np.eye(2)[:, None]
 
     def force_quantities(self, load: ContactLoad, held: HeldLoad) -> Expression:
-        """Compute two quantities (2,) [N] that are smooth in the load. With the coefficients
-        `force_branches` they give the normal forces.
+        """Compute two quantities (2,) [N] that are smooth in the load and from which the normal
+        forces follow: a normal force is the largest of the contact's linear functions
+        `force_branches`. By default the quantities are the normal forces themselves.
 
         Args:
             load: load on both contacts.
@@ -227,8 +229,9 @@ class ContactModel(ABC):
     # --- worst cases ---
 
     def least_friction(self, uncertainty: Uncertainty) -> Array:
-        """Compute the friction coefficients (2,) that cover the worst case of an uncertainty; zero
-        or negative if no friction is left.
+        """Compute friction coefficients (2,) so low that forces computed with them hold for every
+        tilt and displacement of the pads, and every loss of friction, in an uncertainty. Zero or
+        negative if no friction is left.
 
         A pad with friction mu that is tilted by an angle t has the coefficient tan(atan mu - t).
         Pads displaced in opposite directions, by 2 e relative to each other, turn the squeeze into
@@ -302,8 +305,8 @@ class ContactModel(ABC):
         return ca.dot(load.force, load.axes[:, 2])
 
     def internal_force_ratio(self, leader: int) -> Array:
-        """Return the rise (2,) of each robot's normal force if the force-controlled robot presses
-        harder, per newton of this robot's rise.
+        """Return how much the normal force (2,) of each robot rises per newton by which the
+        force-controlled robot presses harder. The force-controlled robot's own entry is 1.
 
         Args:
             leader: index of the robot that is not force-controlled.
@@ -340,8 +343,8 @@ class ContactModel(ABC):
         return self.workcell.contacts[arm].T_box_pad[:3, 2]
 
     def held_with(self, commanded: Array) -> Array:
-        """Return the normal forces (n, 2) [N] with which the payload is held if `commanded` (n, 2)
-        is commanded."""
+        """Return the normal forces (n, 2) [N] that act on the payload if the forces `commanded` (n,
+        2) [N] are commanded. For pads they are equal."""
         return commanded
 
     def pulled_apart(self, along: Array, across: Array, stiffness: float) -> tuple[Array, Array]:

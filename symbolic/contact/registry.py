@@ -25,12 +25,12 @@ def contact_model(workcell: Workcell) -> ContactModel:
 
 
 def squeeze_problem(workcell: Workcell, purpose: str) -> str:
-    """Return the message that something is only for pads that press, if a workcell has hands that
-    hold without a squeeze; '' for pads that press.
+    """Return an error message if a workcell's hands hold without a squeeze; '' if its pads press
+    the payload between them.
 
     Args:
         workcell: the cell.
-        purpose: what needs pads that press; the subject of the message.
+        purpose: subject of the message: what needs pads that press.
     """
     if contact_model(workcell).is_squeeze:
         return ""
@@ -45,7 +45,7 @@ def require_squeeze(workcell: Workcell, purpose: str) -> None:
 
     Args:
         workcell: the cell.
-        purpose: what needs pads that press; the subject of the message.
+        purpose: subject of the error's message: what needs pads that press.
 
     Raises:
         SettingsError: the workcell has hands that hold without a squeeze.

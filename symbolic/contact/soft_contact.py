@@ -168,8 +168,8 @@ class SoftFingerGrasp(SoftFinger):
         return np.asarray(normals / normals[::-1])
 
     def internal_force_ratio(self, leader: int) -> Array:
-        """Return the rise (2,) of each robot's normal force if the force-controlled robot presses
-        harder, per newton of this robot's rise. The ratio is that of the internal squeeze.
+        """Return how much the normal force (2,) of each robot rises per newton by which the
+        force-controlled robot presses harder. The ratio is that of the internal squeeze.
 
         Args:
             leader: index of the robot that is not force-controlled.

@@ -55,8 +55,8 @@ class SoftGrasp:
         self.normals = ca.sparsify(ca.DM(normals))
 
     def first(self) -> ca.Function:
-        """Build the function that computes the pads' normal forces for one load, by the convex
-        program.
+        """Build the function that solves the convex program for one load, and returns the normal
+        forces with their derivatives.
 
         Input: load (6,), force and moment about the box frame's origin, along the box's axes [N, N
         m]. Outputs: normal (2,), normal forces of the robots [N]; slope (6, 2), their derivatives
@@ -133,8 +133,8 @@ class SoftGrasp:
         return ca.Function("slopes", inputs, ca.cse([ca.densify(value) for value in outputs]))
 
     def _newton(self) -> ca.Function:
-        """Build the function of one Newton step: from the states (size,) of all patches to better
-        states for an unchanged load."""
+        """Build the function of one Newton step: from the states (size,) of all patches to states
+        nearer the minimum of the objective f of the module. The load stays balanced."""
         state = ca.SX.sym("state", self.size)
         local = _Local(self, state)
         inputs = [state, *self.grasp.given.values()]
@@ -168,11 +168,12 @@ class _Local:
         self._share = 1.0 / (1.0 - ca.dot(self._g, self._answer))
 
     def solve(self, pull: ca.SX) -> ca.SX:
-        """Compute the change Y y (n,) of the states in a Newton step, from Y' F Y y = Y' pull.
+        """Compute the change (n,) of the states in a Newton step that keeps the load balanced. It
+        is Y y, where y solves Y' F Y y = Y' pull.
 
-        F is the Hessian (n, n) of the objective f (log effort plus weighted barriers) by the
-        states. Y (n, free_size) is the derivative of the states by their free components, and y the
-        change of these components.
+        y is the change of the free components of the states, and Y (n, free_size) the derivative of
+        the states by these components. F is the Hessian (n, n) of the objective f (log effort plus
+        weighted barriers) by the states.
 
         Args:
             pull: (n,) right side, one entry per entry of the states.

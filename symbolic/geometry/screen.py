@@ -190,8 +190,9 @@ class Screen:
 
 
 def screen_of(geometry: CellGeometry) -> Screen:
-    """Compute the numbers of a cell's bodies and pairs, from which distances and motions are
-    bounded."""
+    """Compute the constants that bounds of distances and motions of a cell's bodies need: covers of
+    the bodies by simple shapes, their extents and reaches, and for each pair of bodies the kind of
+    its bound."""
     bodies, arms = geometry.bodies, geometry.arms
     pairs = tuple((pair.first, pair.second) for pair in geometry.possible)
     close = close_pairs(geometry)
@@ -362,7 +363,8 @@ def reach_about_joints(body: CollisionBody, arm: ArmGeometry) -> Array:
 
 
 def _slanted_matters(body: CollisionBody) -> bool:
-    """Return True if a body is the payload, or is markedly longer than wide."""
+    """Return True if distances of a body to obstacles are also to be bounded along the body's own
+    axes: for the payload, and for a body longer than wide by more than `SLANTED_LENGTH`."""
     _, width, length = edges(body.pieces)
     return body.frame.kind == "box" or bool(length - width > SLANTED_LENGTH)
 

@@ -122,10 +122,10 @@ def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
     """Build the function that moves an arm to the next sample of a box path.
 
     Inputs: state (3 n + 1,), which holds the joints (n,) at the previous sample, their first and
-    second difference between samples, and 1 if the path was lost, else 0; pose (6 + m,), the
-    extended pose of the sample; wrench (6,) on the box about the nominal contact point, world axes
-    [N, N m]. Outputs: next_state, then `TRACK_OUTPUTS`: joints, pose residual, lost, joint-limit
-    margin, manipulability, joint torque.
+    second difference between samples, and 1 if an earlier sample was lost, else 0; pose (6 +
+    m,), the extended pose of the sample (box pose, then the cell's m redundant joints); wrench (6,)
+    on the box about the nominal contact point, world axes [N, N m]. Outputs: next_state, then
+    `TRACK_OUTPUTS`: joints, pose residual, lost, joint-limit margin, manipulability, joint torque.
 
     Args:
         robot, model, contact: the arm, its model, and its contact with the box.
@@ -170,8 +170,9 @@ def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
 def torque_function(robot: Robot, model: RobotModel, contact: Contact, name: str) -> ca.Function:
     """Build the function of the joint torques (n,) that exert a contact wrench [N m].
 
-    Inputs: joints (n,) [rad or m], extended pose (6 + m,), and wrench (6,) on the box about the
-    nominal contact point, world axes [N, N m].
+    Inputs: joints (n,) [rad or m]; extended pose (6 + m,), which is the box pose, then the cell's m
+    redundant joints; and wrench (6,) on the box about the nominal contact point, world axes [N, N
+    m].
 
     Args:
         robot, model, contact: the arm, its model, and its contact with the box.
@@ -288,9 +289,10 @@ def follow_function(
     """Build the function of an arm's motion along all samples of a box path.
 
     Inputs: start (n,), joints at the first box pose [rad or m]; pose (6 + m, samples), the extended
-    poses; wrench (6, samples) on the box about the nominal contact point, world axes [N, N m].
-    Outputs of all samples, one column per sample: `TRACK_OUTPUTS`, which are joints, pose residual,
-    lost, joint-limit margin, manipulability and joint torque.
+    poses (box pose, then the cell's m redundant joints); wrench (6, samples) on the box about the
+    nominal contact point, world axes [N, N m]. Outputs of all samples, one column per sample:
+    `TRACK_OUTPUTS`, which are joints, pose residual, lost, joint-limit margin, manipulability and
+    joint torque.
 
     The second sample has no earlier motion to extrapolate, so Newton steps from the start posture
     predict its joints.
@@ -325,9 +327,10 @@ def start_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
     """Build the function of an arm's state before the first sample, the input of `track_function`.
 
     Inputs: start (n,), joints that hold the box at its first pose; pose (6 + m,), the first
-    extended pose. The redundant joints move evenly from their start positions to their values in
-    the extended pose, in `BEGIN_STEPS` Newton steps that keep the flange at the box. Output: state
-    (3 n + 1,) without motion.
+    extended pose (box pose, then the cell's m redundant joints). The redundant joints move evenly
+    from their start positions to their values in the extended pose, in `BEGIN_STEPS` Newton steps
+    that keep the flange at the box. Output: state (3 n + 1,): the joints after these steps, and
+    zeros for their differences and the lost flag.
 
     Args:
         robot, model, contact: the arm, its model, and its contact with the box.
@@ -359,8 +362,9 @@ def prediction_function(
     """Build the function that predicts an arm's motion from the first sample to the second.
 
     Inputs: state (3 n + 1,) of `track_function` after the first sample; pose (6 + m,), the extended
-    pose of the second sample. Output: the state with the joints' first difference that Newton steps
-    find.
+    pose of the second sample (box pose, then the cell's m redundant joints). Output: the state for
+    the second sample, in which the joints' first difference is the one that Newton steps find, and
+    the second difference zero.
 
     Args:
         robot, model, contact: the arm, its model, and its contact with the box.
@@ -524,8 +528,8 @@ def following_columns(model: RobotModel, jacobian: ca.SX) -> ca.SX:
 def _limited(model: RobotModel, q: ca.SX, step: ca.SX) -> ca.SX:
     """Return the joints (n,) after a step of the six joints that follow the box.
 
-    The step is shortened such that no joint moves more than `MAX_JOINT_STEP`, and left out if it is
-    not finite.
+    If a joint would move more than `MAX_JOINT_STEP`, the whole step is shortened. A step that is
+    not finite is left out.
 
     Args:
         model: model of the robot.

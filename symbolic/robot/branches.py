@@ -269,14 +269,18 @@ def _distinct(q: Array) -> Array:
 
 
 def _central_turns(robot: Robot, model: RobotModel, least: Array, greatest: Array) -> Array:
-    """Compute the full turns (n,) [rad] that bring joint paths nearest to the middle of the limits.
+    """Compute the full turns [rad] by which to shift joint paths, so that the middle of each path
+    is as near as possible to the middle of the joint's limits.
 
-    The entries of prismatic and redundant joints are zero.
+    The shifts of prismatic and redundant joints are zero.
 
     Args:
         robot: the arm, with its joint limits.
         model: model of the arm.
         least, greatest: (n,) or (m, n) least and greatest position of each joint on its path [rad].
+
+    Returns:
+        Shifts, multiples of 2 pi, of the shape of `least`.
     """
     middle = (robot.position_lower + robot.position_upper) / 2.0
     free = [turns and k in model.following for k, turns in enumerate(model.turning)]

@@ -88,8 +88,8 @@ def driven_layout(workcell: Workcell) -> DrivenLayout:
 
 
 def planned_branches(workcell: Workcell) -> Array:
-    """Return linear functions of a point's quantities, the largest of which is a contact's planned
-    normal force [N].
+    """Return linear functions of the limited quantities at a point of a path. For each contact, the
+    largest of its functions is the planned normal force [N].
 
     Returns:
         Coefficients (2, b, size) of b functions for each contact, by the quantities (size,) of
@@ -106,9 +106,10 @@ def planned_branches(workcell: Workcell) -> Array:
 def driven_functions(model: CellModel) -> dict[str, ca.Function]:
     """Build, by name, the functions of limited quantities at one point of a path that robots drive.
 
-    Inputs of both: pose, first and second (6 + m,), the extended pose and its first and second
-    derivative by u; q_1 and q_2, the joints of both arms; a = u''; w = u'^2. Together these are the
-    variables y. The cell's symbolic parameters come last.
+    Inputs of both: pose, first and second (6 + m,), the extended pose (box pose, then the cell's m
+    redundant joints) and its first and second derivative by u; q_1 and q_2, the joints of both
+    arms; a = u''; w = u'^2. Together these are the variables y. The cell's symbolic parameters come
+    last.
 
     - driven_first returns value (size,), laid out by `driven_layout`, and slope (size, variables),
       the derivatives by y (NumPy shape).

@@ -126,7 +126,8 @@ class PathConstraint(ABC):
     @property
     @abstractmethod
     def family(self) -> str:
-        """Name of the constraint's family: the constraints that share its compiled functions."""
+        """Name that all constraints have in common which share their compiled functions, such as
+        all joint limits of one arm."""
 
     @abstractmethod
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
@@ -344,12 +345,13 @@ def row_function(place: PathPointSymbols, constraint: PathConstraint, order: Ord
 def closure_functions(model: CellModel, arm: int) -> dict[str, ca.Function]:
     """Build the functions with which an arm's joints follow the box pose, by name.
 
-    F(pose, q) = 0 are the n equations that fix the joints q (n,) at an extended pose (6 + m,) with
-    m redundant joints. The robot's symbolic parameters are the last inputs of both functions.
+    F(pose, q) = 0 are the n equations that fix the joints q (n,) at an extended pose (6 + m,): the
+    box pose, then the cell's m redundant joints. The robot's symbolic parameters are the last
+    inputs of both functions.
 
     - first takes pose, and q_reference (n,), joint positions near the solution. It returns q, the
       joint positions that hold the box; follow (n, 6 + m), the derivative dq/dpose; and pull (n,
-      n), the negative inverse of the derivative of F by q. For a value c of the joints, the
+      n), the negative inverse of the derivative of F by q. For a function c of the joints, the
       multipliers are nu = transposed pull times the gradient of c by q.
     - second takes pose, q and multipliers nu (n,). It returns hessian (6 + m + n, 6 + m + n), the
       second derivatives of nu . F by pose and q.
