@@ -163,7 +163,7 @@ def extreme_attempt(
 
 
 def refinement_attempt(archive: ParetoArchive, objective: int | None) -> ForceAttempt:
-    """Return an attempt to solve the best point at an end of the front to high accuracy.
+    """Return an attempt that starts at the end or middle of the front and solves to high accuracy.
 
     Args:
         archive: the front so far.
@@ -316,8 +316,16 @@ def _target(archive: ParetoArchive, k: int, step: float) -> Scalarisation:
 
 
 def widest_untried_gap(archive: ParetoArchive, tried: Collection[Chord]) -> ForceGap | None:
-    """Return the widest gap between two polished points whose chord (decision vectors on both
-    sides) was not tried yet; None if there is none.
+    """Return the widest untried gap between neighbouring points of the front that the polish made.
+
+    `ForceGap.width` measures gaps in the space of objectives.
+
+    Args:
+        archive: the front so far.
+        tried: pairs of decision vectors on both sides of the gaps that were tried.
+
+    Returns:
+        The gap, or None if all were tried.
     """
     for gap in sorted(gaps(archive), key=lambda gap: -gap.width):
         is_polished = archive.polished[gap.first] and archive.polished[gap.second]
@@ -456,10 +464,10 @@ class ForceRun(PolishRun[ForceAttempt]):
         return min(2 * self._ahead, probe.middle_starts if objective is None else count)
 
     def _remove_probes(self) -> list[tuple[Array, Array]]:
-        """Remove the results of probes from the archive, except the best points at both ends and
-        the middle.
+        """Remove the results of probes (short solves from random starts) from the archive.
 
-        Unfinished points would occupy gaps that are to be filled.
+        The best points at both ends and in the middle of the front stay. The other results are not
+        optimal, and would occupy gaps that further attempts shall fill.
 
         Returns:
             Decision vector (n_var,) and objectives (2,) of each removed point.
@@ -603,8 +611,15 @@ class ForceRun(PolishRun[ForceAttempt]):
     def _ends(
         self, objectives: tuple[int | None, ...], rng: np.random.Generator
     ) -> Iterator[ForceAttempt]:
-        """Yield one attempt for each objective (its index, or None for the balanced middle), and
-        count the attempts without progress."""
+        """Yield one attempt at each of the given ends of the front.
+
+        After each attempt, update the number of successive attempts at this end without progress.
+
+        Args:
+            objectives: index of the objective that is least at each end; None for the balanced
+                middle.
+            rng: generator of perturbed starts.
+        """
         perturb = partial(perturb_start, self._evaluator, rng=rng)
         for objective in objectives:
             before, stalls = self._archive.best(objective)[1], self._stalls[objective]

@@ -127,10 +127,11 @@ def _jump(model: TimingModel, carry: Carry) -> Place | None:
 
 
 def drivable_timing(model: TimingModel, x: Array) -> Timing:
-    """Compute the fastest timing of a drivable carry within its own force limit.
+    """Compute the fastest timing of a path within the force limit that its decision vector states.
 
-    The result is the search's timing if this satisfies the limits between its grid points as well.
-    Otherwise `time_path` computes a new timing.
+    Searches check the limits of a timing at its grid points. If the search's timing of this path
+    satisfies them between these points as well, it is returned; otherwise `time_path` computes a
+    new one.
 
     Args:
         model: timing model of the workcell.

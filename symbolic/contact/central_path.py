@@ -234,15 +234,17 @@ class LocalPatch(Protocol):
 
 
 def least_effort(program: ConvexProgram, *cell: ca.MX, differentiable: bool = False) -> ca.MX:
-    """Build the expression of the wrenches of least effort, one column with the scaled wrenches of
-    all patches.
+    """Build the expression of the contact wrenches of least effort.
+
+    It is one column with the wrenches of all patches, in their order, each in the scaled units of
+    the program.
 
     Args:
         program: the convex program, which defines the effort.
         cell: the program's inputs, then its symbolic parameters.
-        differentiable: True for exact first derivatives. Further steps then move the wrenches onto
-            the central path, and only the last step is differentiated. Second derivatives are not
-            exact.
+        differentiable: True for exact first derivatives. The solution then gets additional steps
+            onto the central path, and only the last of them is differentiated. Second derivatives
+            are not exact.
     """
     if differentiable:
         states, _ = barrier_step(program)(centred(program)(*cell), 1.0, *cell)

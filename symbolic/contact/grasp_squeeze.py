@@ -189,8 +189,9 @@ def commanded_slack(
     """Build the slack of a commanded force, a scalar: a positive slack proves that the force holds
     the load. A negative slack proves nothing.
 
-    The tested forces are the least-norm states that balance the load, plus as much internal squeeze
-    as the commanded force leaves. The slack is positive if these forces lie within all cones.
+    The tested contact wrenches are those of least norm that balance the load, plus the internal
+    squeeze that raises the normal force to the commanded one. The slack is positive if every
+    wrench lies within its friction cone.
 
     Args:
         squeeze: convex program, which knows the commanded robot.

@@ -260,13 +260,13 @@ def _least_force(
 
     Args:
         workcell: the workcell.
-        squeeze: convex program of pads with any normals; None for other pads.
+        squeeze: convex program of pads at any normals; None for two pads with opposite normals.
         inputs: symbols by name: pose, rate, second_rate (6,), case (18,), and parameters by group.
         implicit: collector of results of Newton's method, for exact derivatives; None for none.
         differentiable: True for exact first derivatives of the convex program's solution.
-        displaced: True if the case may displace two opposite pads.
-        beside: additional force and moment (6,) about the box frame's origin [N, N m], for pads
-            with any normals.
+        displaced: True if cases include displacements of the pads; only for opposite normals.
+        beside: force and moment (6,) on the box in addition to its load, about the box frame's
+            origin [N, N m]; only with `squeeze`.
     """
     case = inputs["case"]
     friction, *_ = case_parts(case)

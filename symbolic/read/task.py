@@ -136,10 +136,10 @@ def _check_vectors(task: Task, problems: Problems) -> None:
 
 
 def with_force_limit(workcell: Workcell) -> Workcell:
-    """Return the workcell with bounds of the force limit.
+    """Return the workcell with the range in which searches choose the force limit.
 
-    If the file states none, the lower bound is the force that holds the payload level and at rest
-    plus a thousandth of it, and the upper bound is the smaller reference force.
+    The workcell file may state the range. Otherwise it begins at 1.001 times the force that holds
+    the payload level and at rest, and ends at the smaller of both robots' reference forces.
     """
     task = workcell.task
     if np.isfinite(task.force_limit[1]):

@@ -112,11 +112,11 @@ def rounded_outwards(bounds: Array, limits: Array) -> Array:
 
 
 def readable_turns(poses: Array, orientation: Orientation) -> Array:
-    """Turn back angles of box poses by full turns where they exceed `ANGLE_LIMIT`, the largest
-    angle in a file.
+    """Subtract full turns from the angles of box poses that exceed `ANGLE_LIMIT`, the largest angle
+    that a workcell file may state.
 
-    Rotation vectors stay unchanged. The reader of the file unwraps angles along the path, so the
-    path stays the same.
+    Rotation vectors stay unchanged. Whoever reads the workcell file unwraps angles along the path,
+    so the path stays the same.
 
     Args:
         poses: (n, 6) box poses [m, rad].
