@@ -55,6 +55,9 @@ SEARCH_ROUNDS = ((0, 12, 0), (500, 12, 2), (2500, 6, 6), (8000, 16, 6), (30000, 
 """Rounds of the search, short ones first: number of configurations that the planner may check for a
 path (0 for straight motions alone), number of pairs of holds, and number of `STRAYS`."""
 
+RESTARTS = 3
+"""Number of repetitions of the last round, with other random numbers, while time is left."""
+
 OTHER_FACES = 8000
 """From this number of configurations per path on, other faces of the box are tried too, if both
 arms can hold it by the faces toward them."""
@@ -331,7 +334,7 @@ class _Search:
             choices += [{"contacts": pair} for pair in self.problem.other_contacts()]
         setups = [_Lazy(given, spins) for given in choices]
         found: list[Proposal] = []
-        for effort, most, strays in SEARCH_ROUNDS:
+        for effort, most, strays in (*SEARCH_ROUNDS, *RESTARTS * SEARCH_ROUNDS[-1:]):
             for setup in setups:
                 for one in self._round(setup, effort, most, strays):
                     found.append(one)
