@@ -64,6 +64,10 @@ HAND_SETTINGS = SimulationSettings(time_step=5e-4, settle=0.4)
 """Usual settings. Hands take the payload's weight so slowly that it hardly swings. With steps of
 1 ms and longer, swings between facing hands may grow by themselves."""
 
+HAND_CREEP = 1e5
+"""MuJoCo's impratio for hands. Displacements of some micrometres load their layers; with the value for pads,
+contacts that do not slip lose half of such a force within a second."""
+
 TAKEN = 0.75
 """Share of the settling time in which hands take the payload's weight."""
 
@@ -93,9 +97,12 @@ class HandOutcome(Outcome):
     Attributes:
         lift: (n, 2) largest distance between the payload and the rim of a hand, over the hands of
             each robot [m]; negative while all rims are pressed.
+        force: (hands, 3) force of each hand on the payload at the end, along the hand's axes [N].
+            Its normal part is the pressure in excess of the holding force.
     """
 
     lift: Array
+    force: Array
 
     @property
     def lifts(self) -> bool:
@@ -108,6 +115,7 @@ class HandSimulation:
 
     Attributes:
         workcell, settings: the cell, and settings of the simulation.
+        displacement: (3,) displacement of the second arm, box frame [m].
     """
 
     def __init__(
@@ -126,7 +134,7 @@ class HandSimulation:
                 the acceleration of the motion, world frame [m/s^2].
             opposed: (3,) force of the second arm's hands on the payload with which the arms work
                 against each other, box frame [N]. The second arm is displaced such that this force
-                results.
+                results while no hand slips.
 
         Raises:
             SimulationError: MuJoCo is not installed.
@@ -140,7 +148,7 @@ class HandSimulation:
         self.settings = settings or HAND_SETTINGS
         self._mujoco = mujoco_module()
         self._disturbance = disturbance
-        self._displaced = _displacement(workcell, self.settings.layer, opposed)
+        self.displacement = _displacement(workcell, self.settings.layer, opposed)
         self._model = cache(self._compiled)
 
     def simulate(
@@ -166,8 +174,11 @@ class HandSimulation:
             model.body(f"hand_{k}").pos[:] = hand.T_box_pad[:3, 3] + depth * hand.T_box_pad[:3, 2]
         data = mujoco.MjData(model)
         held = HeldInHands(model, data, self.workcell)
-        second = [int(model.body(f"hand_{k}").id) for k, i in enumerate(robots) if i == 1]
-        at = model.body_pos[second].copy()
+        second = [k for k, i in enumerate(robots) if i == 1]
+        bodies = [int(model.body(f"hand_{k}").id) for k in second]
+        at, along = model.body_pos[bodies].copy(), self._displaced_along(second)
+        normals = np.array([hands[k].T_box_pad[:3, 2] for k in second])
+        springs = [[int(model.joint(f"{name}_{k}").qposadr[0]) for name in HAND_JOINTS[:2]] for k in second]
         box = int(model.joint("box").qposadr[0])
         joints = [
             [int(model.joint(f"{name}_{k}").dofadr[0]) for name in HAND_JOINTS] for k in held.each
@@ -186,7 +197,10 @@ class HandSimulation:
             given = min(1.0, (time - motion.time[0]) / taken)
             given *= given * (3.0 - 2.0 * given)
             model.opt.gravity[:] = gravity * given
-            model.body_pos[second] = at + given * self._displaced
+            # Friction does not feel a body that is placed elsewhere. So a displacement along a patch
+            # moves the rest position of the layer's springs, and the payload bears their force.
+            model.qpos_spring[springs] = given * along[:, :2]
+            model.body_pos[bodies] = at + given * along[:, 2:] * normals
             data.qfrc_applied[joints] = own[k]
             mujoco.mj_step(model, data)
             if k % every or time < motion.time[0] + taken:
@@ -197,7 +211,16 @@ class HandSimulation:
                 break
         times, slips, lifts, turns = (np.array(values) for values in zip(*seen, strict=True))
         holds = bool(slips[-1].max() <= settings.slip and lifts[-1].max() <= 0.0)
-        return HandOutcome(factor, holds, times, slips, turns, lifts)
+        return HandOutcome(factor, holds, times, slips, turns, lifts, held.forces(model))
+
+    def _displaced_along(self, hands: list[int]) -> Array:
+        """Return the displacement of the second arm (n, 3) along the axes of n of its hands [m].
+
+        Args:
+            hands: indices of the hands.
+        """
+        axes = np.array([self._hands[k].T_box_pad[:3, :3] for k in hands])
+        return np.asarray(self.displacement @ axes)
 
     @property
     def _hands(self) -> tuple[Contact, ...]:
@@ -211,7 +234,7 @@ class HandSimulation:
             f'<adhesion body="hand_{k}" ctrlrange="0 1e6" gain="1"/>'
             for k in range(len(self._hands))
         )
-        text = carriage_text(self.workcell, settings, self._disturbance, hands, pulls)
+        text = carriage_text(self.workcell, settings, self._disturbance, hands, pulls, HAND_CREEP)
         return compiled(self._mujoco, text, LIP_DAMPING)[0]
 
 
@@ -303,6 +326,26 @@ class HeldInHands:
         )
         turn = Rotation.from_matrix(self._settled[1].T @ turned).magnitude()
         return slip, lift, float(turn)
+
+
+    def forces(self, model: Any) -> Array:
+        """Measure the force (hands, 3) of each hand on the payload along the hand's axes, the
+        normal part without the holding force [N].
+
+        Args:
+            model: MuJoCo's model of the scene, in which the displacement of the arms has changed the
+                rest positions of the springs.
+        """
+        data, contact = self._data, self._data.contact
+        active = contact.efc_address >= 0
+        pressed = np.zeros(model.nbody)
+        bodies = model.geom_bodyid[contact.geom[active]]
+        np.add.at(pressed, bodies, data.efc_force[contact.efc_address[active]][:, None])
+        joints = [[model.joint(f"{name}_{k}") for name in HAND_JOINTS[:2]] for k in self.each]
+        at = [[int(joint.qposadr[0]) for joint in each] for each in joints]
+        stiffness = [[float(joint.stiffness[0]) for joint in each] for each in joints]
+        along = np.array(stiffness) * (model.qpos_spring[at] - data.qpos[at])
+        return np.column_stack([along, pressed[self._bodies] - data.ctrl])
 
 
 def swing_frequency(workcell: Workcell, settings: SimulationSettings = HAND_SETTINGS) -> float:

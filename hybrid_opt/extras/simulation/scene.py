@@ -203,6 +203,7 @@ def carriage_text(
     disturbance: ArrayLike,
     bodies: str,
     actuators: str = "",
+    creep: float = CREEP,
 ) -> str:
     """Return the MJCF document of a free payload and a carriage, a heavy body that bears pads or
     hands.
@@ -214,6 +215,7 @@ def carriage_text(
             acceleration of the motion, world frame [m/s^2].
         bodies: MJCF of the bodies on the carriage.
         actuators: MJCF of the actuators.
+        creep: MuJoCo's impratio.
     """
     payload, touched = workcell.payload, 'contype="0" conaffinity="1"'
     if presses_on_box(workcell):
@@ -223,7 +225,7 @@ def carriage_text(
     return f"""
 <mujoco>
   <compiler angle="radian"/>
-  {solver_options(settings, np.array(GRAVITY) - np.asarray(disturbance), CARRIAGE_MASS)}
+  {solver_options(settings, np.array(GRAVITY) - np.asarray(disturbance), CARRIAGE_MASS, creep)}
   <worldbody>
     <body name="carriage" gravcomp="1">
       <freejoint/>
@@ -278,7 +280,9 @@ def box_body(payload: Payload, geoms: str) -> str:
     </body>"""
 
 
-def solver_options(settings: ContactSettings, gravity: Array, heaviest: float = 1.0) -> str:
+def solver_options(
+    settings: ContactSettings, gravity: Array, heaviest: float = 1.0, creep: float = CREEP
+) -> str:
     """Return MuJoCo's options as MJCF. They select elliptic friction cones, a small tolerance of
     the solver, and a large `impratio`, which keeps frictional contacts from creeping.
 
@@ -286,9 +290,10 @@ def solver_options(settings: ContactSettings, gravity: Array, heaviest: float = 
         settings: settings of the contacts.
         gravity: (3,) gravity in the world [m/s^2].
         heaviest: mass of the heaviest body, if it is much heavier than the box [kg].
+        creep: MuJoCo's impratio.
     """
     return f"""<option timestep="{settings.time_step!r}" gravity="{mjcf_text(gravity)}"
-    cone="elliptic" impratio="{CREEP!r}" integrator="implicitfast" solver="Newton"
+    cone="elliptic" impratio="{creep!r}" integrator="implicitfast" solver="Newton"
     iterations="200" tolerance="{MUJOCO_TOLERANCE / heaviest!r}"/>"""
 
 

@@ -96,6 +96,37 @@ def test_arms_that_pull_against_one_another_lift_a_rim() -> None:
     assert along.simulate(motion, MASS * G / 2.0 + 0.5 * pull / FRICTION).holds
 
 
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("where", [ABOVE, BESIDE])
+def test_a_displaced_arm_loads_the_layers_as_springs_in_series(where: str, axis: int) -> None:
+    """Two equal springs in series, whose moments turn the payload between arms that do not turn:
+    each bears half of the couple with its stiffness against that rotation."""
+    workcell, pull = two_cups(where), 8.0 * np.eye(3)[axis]
+    area = np.pi * RADIUS**2
+    normal = HAND_SETTINGS.layer * area
+    shear, bending, torsion = normal / 3.0, normal * RADIUS**2 / 2.0, normal / 3.0 * RADIUS**2
+    distance = float(np.ptp([contact.T_box_pad[1, 3] for contact in workcell.contacts]))
+    # Both cups are in line along y: across this line the payload turns.
+    along, turning = {
+        (ABOVE, 0): (shear, torsion),
+        (ABOVE, 1): (shear, np.inf),
+        (ABOVE, 2): (normal, bending),
+        (BESIDE, 0): (shear, bending),
+        (BESIDE, 1): (normal, np.inf),
+        (BESIDE, 2): (shear, bending),
+    }[where, axis]
+    compliance = 2.0 / along + distance**2 / (2.0 * turning)
+    motion = carriage_motion(carry_along(workcell, np.zeros(6), 0.3), HAND_SETTINGS)
+    simulation = HandSimulation(workcell, opposed=pull)
+    rest = HandSimulation(workcell).simulate(motion, 200.0).force
+    expected = np.linalg.norm(simulation.displacement) / compliance
+    assert expected == pytest.approx(8.0, rel=1e-6)
+    loaded = simulation.simulate(motion, 200.0).force - rest
+    for contact, force, sign in zip(workcell.pads, loaded, (-1.0, 1.0), strict=True):
+        found = contact.T_box_pad[:3, :3] @ force
+        np.testing.assert_allclose(found, sign * pull, atol=0.035 * expected)
+
+
 def test_a_rim_lifts_where_the_pressure_leaves_the_kern() -> None:
     """Accelerated across the line of both cups, with the centre of mass below them."""
     workcell = two_cups(ABOVE)
