@@ -65,8 +65,8 @@ HAND_SETTINGS = SimulationSettings(time_step=5e-4, settle=0.4)
 1 ms and longer, swings between facing hands may grow by themselves."""
 
 HAND_CREEP = 1e5
-"""MuJoCo's impratio for hands. Displacements of some micrometres load their layers; with the value for pads,
-contacts that do not slip lose half of such a force within a second."""
+"""MuJoCo's impratio for hands. Displacements of some micrometres load their layers; with the value
+for pads, contacts that do not slip lose half of such a force within a second."""
 
 TAKEN = 0.75
 """Share of the settling time in which hands take the payload's weight."""
@@ -178,7 +178,9 @@ class HandSimulation:
         bodies = [int(model.body(f"hand_{k}").id) for k in second]
         at, along = model.body_pos[bodies].copy(), self._displaced_along(second)
         normals = np.array([hands[k].T_box_pad[:3, 2] for k in second])
-        springs = [[int(model.joint(f"{name}_{k}").qposadr[0]) for name in HAND_JOINTS[:2]] for k in second]
+        springs = [
+            [int(model.joint(f"{name}_{k}").qposadr[0]) for name in HAND_JOINTS[:2]] for k in second
+        ]
         box = int(model.joint("box").qposadr[0])
         joints = [
             [int(model.joint(f"{name}_{k}").dofadr[0]) for name in HAND_JOINTS] for k in held.each
@@ -197,8 +199,8 @@ class HandSimulation:
             given = min(1.0, (time - motion.time[0]) / taken)
             given *= given * (3.0 - 2.0 * given)
             model.opt.gravity[:] = gravity * given
-            # Friction does not feel a body that is placed elsewhere. So a displacement along a patch
-            # moves the rest position of the layer's springs, and the payload bears their force.
+            # Friction does not feel a body that is placed elsewhere. So a displacement along a
+            # patch moves the rest position of the layer's springs.
             model.qpos_spring[springs] = given * along[:, :2]
             model.body_pos[bodies] = at + given * along[:, 2:] * normals
             data.qfrc_applied[joints] = own[k]
@@ -327,14 +329,13 @@ class HeldInHands:
         turn = Rotation.from_matrix(self._settled[1].T @ turned).magnitude()
         return slip, lift, float(turn)
 
-
     def forces(self, model: Any) -> Array:
         """Measure the force (hands, 3) of each hand on the payload along the hand's axes, the
         normal part without the holding force [N].
 
         Args:
-            model: MuJoCo's model of the scene, in which the displacement of the arms has changed the
-                rest positions of the springs.
+            model: MuJoCo's model of the scene, with the rest positions of the springs after the
+                displacement of the arms.
         """
         data, contact = self._data, self._data.contact
         active = contact.efc_address >= 0
