@@ -124,7 +124,7 @@ def test_a_displaced_arm_loads_the_layers_as_springs_in_series(where: str, axis:
     loaded = simulation.simulate(motion, 200.0).force - rest
     for contact, force, sign in zip(workcell.pads, loaded, (-1.0, 1.0), strict=True):
         found = contact.T_box_pad[:3, :3] @ force
-        np.testing.assert_allclose(found, sign * pull, atol=0.035 * expected)
+        np.testing.assert_allclose(found, sign * pull, atol=0.035 * float(expected))
 
 
 def test_a_rim_lifts_where_the_pressure_leaves_the_kern() -> None:
