@@ -425,7 +425,7 @@ class Export:
             grip=self.workcell.handling.grip_limit,
             # An arm that stands is noticed where it is `behind`; one that has no link any more,
             # where it is silent. Half of a stop's time passes at the planned speed.
-            partner_stop=max(behind, SILENCE) + REACTION + self.lag + self.stop.quick / 2.0,
+            partner_stop_time=max(behind, SILENCE) + REACTION + self.lag + self.stop.quick / 2.0,
         )
 
     @cached_property
@@ -435,7 +435,7 @@ class Export:
         Raises:
             JobError: the pads would move farther apart than the cell allows.
         """
-        job, k, time = self.job, self.stiffness, self.limits.partner_stop
+        job, k, time = self.job, self.stiffness, self.limits.partner_stop_time
         survived = None if k is None else separation(job, largest_skew(job, k, time))
         allowed = self.workcell.handling.partner_stop
         found = PartnerStop(time, separation(job, time), survived, allowed)

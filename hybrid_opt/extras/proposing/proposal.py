@@ -56,7 +56,8 @@ SEARCH_ROUNDS = ((0, 12, 0), (500, 12, 2), (2500, 6, 6), (8000, 16, 6), (30000, 
 path (0 for straight motions alone), number of pairs of holds, and number of `STRAYS`."""
 
 RESTARTS = 3
-"""Number of repetitions of the last round, with other random numbers, while time is left."""
+"""Number of repetitions of the last round, with other random numbers, while no carry is found and
+time is left."""
 
 OTHER_FACES = 8000
 """From this number of configurations per path on, other faces of the box are tried too, if both
@@ -334,7 +335,10 @@ class _Search:
             choices += [{"contacts": pair} for pair in self.problem.other_contacts()]
         setups = [_Lazy(given, spins) for given in choices]
         found: list[Proposal] = []
-        for effort, most, strays in (*SEARCH_ROUNDS, *RESTARTS * SEARCH_ROUNDS[-1:]):
+        rounds = [*SEARCH_ROUNDS, *RESTARTS * SEARCH_ROUNDS[-1:]]
+        for number, (effort, most, strays) in enumerate(rounds):
+            if number >= len(SEARCH_ROUNDS) and (found or self.too_late):
+                break
             for setup in setups:
                 for one in self._round(setup, effort, most, strays):
                     found.append(one)

@@ -64,7 +64,7 @@ HAND_SETTINGS = SimulationSettings(time_step=5e-4, settle=0.4)
 """Usual settings. Hands take the payload's weight so slowly that it hardly swings. With steps of
 1 ms and longer, swings between facing hands may grow by themselves."""
 
-HAND_CREEP = 1e5
+HAND_IMPRATIO = 1e5
 """MuJoCo's impratio for hands. Displacements of some micrometres load their layers; with the value
 for pads, contacts that do not slip lose half of such a force within a second."""
 
@@ -178,9 +178,6 @@ class HandSimulation:
         bodies = [int(model.body(f"hand_{k}").id) for k in second]
         at, along = model.body_pos[bodies].copy(), self._displaced_along(second)
         normals = np.array([hands[k].T_box_pad[:3, 2] for k in second])
-        springs = [
-            [int(model.joint(f"{name}_{k}").qposadr[0]) for name in HAND_JOINTS[:2]] for k in second
-        ]
         box = int(model.joint("box").qposadr[0])
         joints = [
             [int(model.joint(f"{name}_{k}").dofadr[0]) for name in HAND_JOINTS] for k in held.each
@@ -201,7 +198,7 @@ class HandSimulation:
             model.opt.gravity[:] = gravity * given
             # Friction does not feel a body that is placed elsewhere. So a displacement along a
             # patch moves the rest position of the layer's springs.
-            model.qpos_spring[springs] = given * along[:, :2]
+            model.qpos_spring[held.slides[second]] = given * along[:, :2]
             model.body_pos[bodies] = at + given * along[:, 2:] * normals
             data.qfrc_applied[joints] = own[k]
             mujoco.mj_step(model, data)
@@ -236,7 +233,9 @@ class HandSimulation:
             f'<adhesion body="hand_{k}" ctrlrange="0 1e6" gain="1"/>'
             for k in range(len(self._hands))
         )
-        text = carriage_text(self.workcell, settings, self._disturbance, hands, pulls, HAND_CREEP)
+        text = carriage_text(
+            self.workcell, settings, self._disturbance, hands, pulls, HAND_IMPRATIO
+        )
         return compiled(self._mujoco, text, LIP_DAMPING)[0]
 
 
@@ -283,6 +282,8 @@ class HeldInHands:
 
     Attributes:
         each: indices of the hands, those of the first robot first.
+        slides: (hands, 2) addresses in MuJoCo's `qpos` of the joints by which the layers give way
+            along the patches.
     """
 
     def __init__(self, model: Any, data: Any, workcell: Workcell) -> None:
@@ -294,6 +295,9 @@ class HeldInHands:
         """
         self.each, self._robots = range(len(workcell.pads)), np.array(workcell.pad_robots)
         self._bodies = [int(model.body(f"hand_{k}").id) for k in self.each]
+        slides = [[model.joint(f"{name}_{k}") for name in HAND_JOINTS[:2]] for k in self.each]
+        self.slides = np.array([[int(joint.qposadr[0]) for joint in own] for own in slides])
+        self._slide_stiffness = np.array([[joint.stiffness[0] for joint in own] for own in slides])
         self._box, self._carriage = (int(model.body(name).id) for name in ("box", "carriage"))
         self._data = data
         rims = np.array([rim(hand, RIM_PLACES) for hand in workcell.pads])
@@ -342,10 +346,8 @@ class HeldInHands:
         pressed = np.zeros(model.nbody)
         bodies = model.geom_bodyid[contact.geom[active]]
         np.add.at(pressed, bodies, data.efc_force[contact.efc_address[active]][:, None])
-        joints = [[model.joint(f"{name}_{k}") for name in HAND_JOINTS[:2]] for k in self.each]
-        at = [[int(joint.qposadr[0]) for joint in each] for each in joints]
-        stiffness = [[float(joint.stiffness[0]) for joint in each] for each in joints]
-        along = np.array(stiffness) * (model.qpos_spring[at] - data.qpos[at])
+        stretch = model.qpos_spring[self.slides] - data.qpos[self.slides]
+        along = self._slide_stiffness * stretch
         return np.column_stack([along, pressed[self._bodies] - data.ctrl])
 
 

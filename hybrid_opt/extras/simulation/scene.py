@@ -63,7 +63,7 @@ LAYER_DAMPING = 0.7
 """Damping ratio of a pad's layer. With less damping the pads lose contact where accelerations jump.
 With more damping a sliding pad is pushed off, which widens its pressure."""
 
-CREEP = 3e3
+IMPRATIO = 3e3
 """MuJoCo's impratio: the factor by which frictional contacts creep less than normal ones."""
 
 MUJOCO_TOLERANCE = 1e-12
@@ -203,7 +203,7 @@ def carriage_text(
     disturbance: ArrayLike,
     bodies: str,
     actuators: str = "",
-    creep: float = CREEP,
+    impratio: float = IMPRATIO,
 ) -> str:
     """Return the MJCF document of a free payload and a carriage, a heavy body that bears pads or
     hands.
@@ -215,7 +215,7 @@ def carriage_text(
             acceleration of the motion, world frame [m/s^2].
         bodies: MJCF of the bodies on the carriage.
         actuators: MJCF of the actuators.
-        creep: MuJoCo's impratio.
+        impratio: MuJoCo's option: the larger it is, the less frictional contacts creep.
     """
     payload, touched = workcell.payload, 'contype="0" conaffinity="1"'
     if presses_on_box(workcell):
@@ -225,7 +225,7 @@ def carriage_text(
     return f"""
 <mujoco>
   <compiler angle="radian"/>
-  {solver_options(settings, np.array(GRAVITY) - np.asarray(disturbance), CARRIAGE_MASS, creep)}
+  {solver_options(settings, np.array(GRAVITY) - np.asarray(disturbance), CARRIAGE_MASS, impratio)}
   <worldbody>
     <body name="carriage" gravcomp="1">
       <freejoint/>
@@ -281,7 +281,7 @@ def box_body(payload: Payload, geoms: str) -> str:
 
 
 def solver_options(
-    settings: ContactSettings, gravity: Array, heaviest: float = 1.0, creep: float = CREEP
+    settings: ContactSettings, gravity: Array, heaviest: float = 1.0, impratio: float = IMPRATIO
 ) -> str:
     """Return MuJoCo's options as MJCF. They select elliptic friction cones, a small tolerance of
     the solver, and a large `impratio`, which keeps frictional contacts from creeping.
@@ -290,10 +290,10 @@ def solver_options(
         settings: settings of the contacts.
         gravity: (3,) gravity in the world [m/s^2].
         heaviest: mass of the heaviest body, if it is much heavier than the box [kg].
-        creep: MuJoCo's impratio.
+        impratio: MuJoCo's option: the larger it is, the less frictional contacts creep.
     """
     return f"""<option timestep="{settings.time_step!r}" gravity="{mjcf_text(gravity)}"
-    cone="elliptic" impratio="{creep!r}" integrator="implicitfast" solver="Newton"
+    cone="elliptic" impratio="{impratio!r}" integrator="implicitfast" solver="Newton"
     iterations="200" tolerance="{MUJOCO_TOLERANCE / heaviest!r}"/>"""
 
 

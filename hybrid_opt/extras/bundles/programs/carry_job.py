@@ -55,8 +55,8 @@ class Limits:
             the reference.
         silence: longest time since an arm's last measurement [s].
         grip: longest wait for inputs to report that hands hold or are open [s].
-        partner_stop: planned time by which the path goes on after an arm has stopped by itself,
-            until it rests there [s].
+        partner_stop_time: planned time that passes after one arm has stopped by itself, until both
+            arms are at rest [s].
     """
 
     stop_time: float
@@ -68,7 +68,7 @@ class Limits:
     force: float
     silence: float
     grip: float
-    partner_stop: float
+    partner_stop_time: float
 
 
 @dataclass(frozen=True)

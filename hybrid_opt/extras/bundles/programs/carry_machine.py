@@ -288,7 +288,7 @@ class Machine:
         if seen.fault:
             raise Refused(seen.fault)
         # An arm that has stopped by itself is behind by what the other one took to stop.
-        self._require_places(seen, self.job.limits.path, self.job.limits.partner_stop)
+        self._require_places(seen, self.job.limits.path, self.job.limits.partner_stop_time)
         self.state, self._strikes = "running", 0
         self._aim(direction)
         self.clock.turn(direction)
@@ -456,13 +456,13 @@ class Machine:
     def _name(self, arm: int) -> str:
         return str(self.job.robots[arm]["name"])
 
-    def _require_places(self, seen: Seen, most: float, way: float = 0.0) -> None:
+    def _require_places(self, seen: Seen, most: float, slack: float = 0.0) -> None:
         """Check that both arms report and are where the job stands.
 
         Args:
             seen: measured state of both arms.
             most: largest distance of a pad from its path [m].
-            way: planned time [s] by which an arm may be elsewhere along its path.
+            slack: planned time by which an arm may be ahead or behind on its path [s].
 
         Raises:
             Refused: an arm is silent or elsewhere.
@@ -471,7 +471,7 @@ class Machine:
         for arm, q in enumerate(seen.q):
             if q is None or seen.age[arm] > self.job.limits.silence:
                 raise Refused(self._no_news(arm, seen))
-            at = self.job.coordinate(arm, q, s, (-way, way)) if way else s
+            at = self.job.coordinate(arm, q, s, (-slack, slack)) if slack else s
             away = self.job.distance(arm, q, at)
             if away > most:
                 raise Refused(

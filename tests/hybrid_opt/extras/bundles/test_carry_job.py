@@ -201,18 +201,18 @@ def test_late_news_at_the_end_do_not_hold_the_job(silent: int, state: str) -> No
     assert machine.state == state, machine.status()
 
 
-@pytest.mark.parametrize(("age", "told"), [(0.0, "right is "), (0.3, "left and right are ")])
-def test_nothing_is_said_of_arms_that_are_silent(age: float, told: str) -> None:
+@pytest.mark.parametrize(("age", "silent"), [(0.0, "right is "), (0.3, "left and right are ")])
+def test_nothing_is_said_of_arms_that_are_silent(age: float, silent: str) -> None:
     machine = running(job().begin("carry") + 2.0)
     ticks(machine, lambda s: Seen(posture(s), age=[age, 0.3]))
-    assert f" {told}silent" in machine.status()
+    assert f" {silent}silent" in machine.status()
 
 
 @pytest.mark.parametrize("stopped", [(True, False), (False, True), (True, True)])
 def test_arms_that_stopped_by_themselves_go_on_from_there(stopped: tuple[bool, bool]) -> None:
     """They are behind by what the stop of the others took. One that is farther away has to be
     moved first."""
-    s, way = job().begin("carry") + 2.0, job().limits.partner_stop
+    s, way = job().begin("carry") + 2.0, job().limits.partner_stop_time
 
     def seen(behind: float) -> Seen:
         at = [s - behind if each else s for each in stopped]

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 import tomllib
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +20,7 @@ from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.extras.proposing import proposal as proposal_module
 from hybrid_opt.extras.proposing import setup
 from hybrid_opt.extras.proposing.problem import Problem
-from hybrid_opt.extras.proposing.proposal import propose_classes, worked
+from hybrid_opt.extras.proposing.proposal import RESTARTS, SEARCH_ROUNDS, propose_classes, worked
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
 from symbolic.read.cell import load
@@ -90,6 +91,26 @@ def test_the_rack_gets_a_certified_carry(proposal: ho.Proposal, tmp_path: Path) 
     assert proposal.feasible_share == pytest.approx(found.feasible.mean(), abs=0.06)
     assert "# Two GoFa 12 carry a box" in path.read_text(encoding="utf-8"), "comments stay"
     assert "certified" in str(proposal)
+
+
+@pytest.mark.parametrize("repetition", [1, RESTARTS])
+def test_the_last_round_is_repeated_until_a_carry_is_found(
+    proposal: ho.Proposal, repetition: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rounds: list[int] = []
+
+    def attempts(_: object, lazy: object, effort: int, *__: object) -> Iterator[ho.Proposal]:
+        first.append(lazy)
+        if lazy is first[0]:
+            rounds.append(effort)
+            if len(rounds) == len(SEARCH_ROUNDS) + repetition:
+                yield proposal
+
+    first: list[object] = []
+    monkeypatch.setattr("hybrid_opt.extras.proposing.proposal._Search._round", attempts)
+    assert ho.propose(rack_problem(tmp_path), rng=np.random.default_rng(1)) is proposal
+    last = SEARCH_ROUNDS[-1][0]
+    assert rounds == [effort for effort, *_ in SEARCH_ROUNDS] + [last] * repetition
 
 
 def test_what_a_carry_passes_is_told(proposal: ho.Proposal) -> None:
