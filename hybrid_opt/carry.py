@@ -16,8 +16,9 @@ import numpy as np
 from codegen.function import NumericFunction
 from hybrid_opt.display_protocol import Displayable, Page, display
 from hybrid_opt.indicators.metrics import excess_above_static
-from hybrid_opt.static_hold import limited_force, payload_limit, static_hold
+from hybrid_opt.static_hold import payload_limit, static_hold
 from symbolic.array import Array, set_read_only
+from symbolic.contact.registry import contact_model
 from symbolic.path.spline import sample_basis
 from symbolic.records import Workcell
 from symbolic.records.task import waypoints_of
@@ -178,12 +179,10 @@ class Carry(Displayable):
         """Payload mass [kg] at which the first of the robots reaches its reference force on the
         same motion.
 
-        All forces grow in proportion to the mass. The limited force of a pad is the magnitude of
-        its contact force, friction included; for hands that grip on their own it is the normal
-        force.
+        All forces grow in proportion to the mass.
         """
         forces = self.peak_normal_force, self.peak_resultant_force
-        return payload_limit(self.workcell, limited_force(self.workcell, *forces))
+        return payload_limit(self.workcell, contact_model(self.workcell).limited_force(*forces))
 
     @property
     def excess_above_static(self) -> Array:

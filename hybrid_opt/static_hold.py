@@ -66,23 +66,8 @@ def static_hold(workcell: Workcell) -> StaticHold:
     whole = np.linalg.norm(outputs["contact_force"].reshape(2, 3), axis=1)
     for force in (normal, whole):
         force.setflags(write=False)
-    return StaticHold(
-        normal, whole, payload_limit(workcell, limited_force(workcell, normal, whole))
-    )
-
-
-def limited_force(workcell: Workcell, normal: Array, whole: Array) -> Array:
-    """Return for each robot the force (2,) [N] that its reference force limits.
-
-    For pads it is the magnitude of the contact force, for hands that grip on their own the normal
-    force.
-
-    Args:
-        workcell: the description of the cell.
-        normal: (2,) normal force of each robot [N].
-        whole: (2,) magnitude of each robot's contact force [N].
-    """
-    return whole if contact_model(workcell).is_squeeze else normal
+    limited = contact_model(workcell).limited_force(normal, whole)
+    return StaticHold(normal, whole, payload_limit(workcell, limited))
 
 
 def mass_at_reference(workcell: Workcell, force: Array) -> Array:
@@ -282,16 +267,17 @@ class _Still:
     def _contact_uses(
         self, where: str, load: dict[str, Array], mass: float
     ) -> Iterator[StaticUtilisation]:
-        workcell = self._workcell
+        workcell, contact = self._workcell, contact_model(self._workcell)
         whole = np.linalg.norm(load["contact_force"].reshape(2, 3), axis=1)
+        limited = contact.limited_force(load["normal_force"], whole)
         for i, robot in enumerate(workcell.robots):
             allowed = float(workcell.task.reference_force[i])
             normal = mass * float(load["normal_force"][i])
-            most = mass * float(limited_force(workcell, load["normal_force"], whole)[i])
+            most = mass * float(limited[i])
             # Where a pad presses too hard already, its whole force says nothing new.
             name, force = (WHOLE, most) if normal <= allowed < most else (NORMAL, normal)
             yield StaticUtilisation(name, robot.name, where, force, allowed, "N")
-            if contact_model(workcell).has_pressure_limit:
+            if contact.has_pressure_limit:
                 shift, radius = float(load["pressure_shift"][i]), workcell.contacts[i].patch_radius
                 yield StaticUtilisation(
                     PRESSURE, robot.name, where, 1e3 * shift, 1e3 * radius, "mm"

@@ -186,14 +186,8 @@ def _joint_length(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute for n candidates the largest used share of the friction if both pads press with the
-    reference force, (n,).
-
-    The least normal forces use the friction fully, by construction. So the forces N_1 and N_2 are
-    raised to the reference force, with their difference kept. The needed friction coefficient is
-    the sum of both tangential forces over N_1 + N_2; the result is its ratio to the smaller
-    coefficient. For hands that hold without a squeeze the result is the tangential force of a hand
-    over the friction of its holding force.
+    """Compute for n candidates the largest used share of the friction if both arms hold with their
+    reference forces, (n,).
 
     Args:
         outputs: outputs of the evaluator by name.
@@ -202,15 +196,8 @@ def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
     # Not imported at the top: programs' options name objectives without CasADi.
     from symbolic.contact.registry import contact_model
 
-    if not contact_model(workcell).is_squeeze:
-        bearing = workcell.task.reference_force * [pad.friction for pad in workcell.contacts]
-        return np.asarray((outputs["tangential_force"] / bearing).max(axis=(1, 2)))
-    force = outputs["normal_force"]
-    difference = np.abs(force[:, :, 0] - force[:, :, 1])
-    squeeze = 2.0 * float(workcell.task.reference_force.min()) - difference
-    needed = outputs["tangential_force"].sum(axis=2) / np.maximum(squeeze, 1e-9)
-    use: Array = needed.max(axis=1)
-    return use / min(contact.friction for contact in workcell.contacts)
+    forces = outputs["normal_force"], outputs["tangential_force"]
+    return contact_model(workcell).friction_use(*forces)
 
 
 def _robust_forces(outputs: Outputs, workcell: Workcell) -> Array:

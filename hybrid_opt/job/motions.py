@@ -27,8 +27,6 @@ from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, extra_normal_for
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits
 from symbolic.array import Array, interpolated
-from symbolic.contact.force_closure import robot_wrenches
-from symbolic.contact.grasp import Grasp
 from symbolic.contact.registry import command_model, contact_model
 from symbolic.records import Handling, Workcell
 from symbolic.records.poses import box_rotation
@@ -371,8 +369,6 @@ def carry_motion(model: TimingModel, carry: Carry) -> PhaseMotion:
 USE_TOLERANCE = 1.005
 """A job is refused if a limit is used beyond this ratio."""
 
-_FORCE_FLOOR = 1e-9
-
 _SAME_TIME = 1e-9
 
 _NO_JUMP = 1e-6
@@ -467,10 +463,6 @@ def unit_squeeze(workcell: Workcell, pose: Array, leader: int = 0) -> Array:
     """Compute by how much the wrenches of both robots on the box change per newton of additional
     commanded force.
 
-    For pads with opposite normals both forces act on one line, midway between the nominal contact
-    points, and cancel. For other pads the change is an internal squeeze within all friction cones.
-    For hands that grip the box without a squeeze it is zero.
-
     Args:
         workcell: the workcell.
         pose: (n, 6) box poses [m, rad].
@@ -480,27 +472,8 @@ def unit_squeeze(workcell: Workcell, pose: Array, leader: int = 0) -> Array:
         Change (n, 2, 6) of force [N/N] and moment about the robot's nominal contact point [N m/N],
         world axes.
     """
-    if not contact_model(workcell).is_squeeze:
-        return np.zeros((len(pose), 2, 6))
     turned = box_rotation(workcell.task.orientation, pose)
-    if not workcell.has_opposite_pads:
-        grasp = Grasp(workcell)
-        to_robots = robot_wrenches(workcell).reshape(6, -1, 6)
-        each = np.einsum("ipj,pj->pi", to_robots, grasp.squeeze_wrenches())
-        parts = np.stack([each[np.array(grasp.robots) == robot].sum(axis=0) for robot in (0, 1)])
-        axes = workcell.contacts[0].T_box_pad[:3, :3]
-        wrenches = parts.reshape(2, 2, 3) @ axes.T / grasp.squeeze_normals()[1 - leader]
-        return np.asarray(np.einsum("nij,abj->nabi", turned, wrenches).reshape(len(pose), 2, 6))
-    first, second = (contact.T_box_pad for contact in workcell.contacts)
-    normal = first[:3, 2]
-    apart = second[:3, 3] - first[:3, 3]
-    beside = (apart - (apart @ normal) * normal) / 2.0
-    wrenches = np.array(
-        [
-            np.concatenate([sign * normal, np.cross(sign * beside, sign * normal)])
-            for sign in (1.0, -1.0)
-        ]
-    ).reshape(2, 2, 3)
+    wrenches = contact_model(workcell).squeeze_wrenches(leader).reshape(2, 2, 3)
     return np.asarray(np.einsum("nij,abj->nabi", turned, wrenches).reshape(len(pose), 2, 6))
 
 
@@ -522,10 +495,7 @@ def phase_use(
 
     effort = motion.own_torque + motion.contact_effort(force.wrench)
     payload, bounded = workcell.payload, dict[str, float]()
-    contact = contact_model(workcell)
-    held = np.maximum(contact.held_with(force.normal), _FORCE_FLOOR)
-    if not contact.is_squeeze:
-        bounded["holding force"] = _most(force.normal / held)
+    forces = contact_model(workcell).force_use(force.normal, force.least)
     if jerk is not None and np.isfinite(jerk.joints).any():
         bounded["joint jerk"] = _most(_jerk(motion.time, motion.q_second) / jerk.joints)
     if jerk is not None and np.isfinite(jerk.payload):
@@ -536,7 +506,7 @@ def phase_use(
         "joint torque": _most(np.abs(effort) / workcell.stack_joint_limits("torque_max")),
         "payload velocity": _most(_length(motion.rate) / payload.velocity_max),
         "payload acceleration": _most(_length(motion.second_rate) / payload.acceleration_max),
-        "least normal force": _most(force.least / held),
+        **{name: _most(ratio) for name, ratio in forces.items()},
     }
 
 

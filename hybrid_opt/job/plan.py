@@ -509,7 +509,7 @@ class JobModel:
                 )
             name, ratio = max(use.items(), key=lambda item: item[1])
             if ratio > USE_TOLERANCE:
-                less = "press less (squeeze), or " if contact.is_squeeze else ""
+                less = f"{contact.relief}, or " if contact.relief else ""
                 raise JobError(
                     f"{title}: uses {100.0 * ratio:.1f} % of the limit on {name}; {less}choose a "
                     "slower timing",

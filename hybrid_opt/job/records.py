@@ -185,7 +185,7 @@ class Job(Displayable):
     @property
     def follower(self) -> int | None:
         """Index of the force-controlled arm; None if hands grip the box without a squeeze."""
-        return 1 - self.squeeze.leader if contact_model(self.workcell).is_squeeze else None
+        return contact_model(self.workcell).follower(self.squeeze.leader)
 
     @property
     def control(self) -> str:

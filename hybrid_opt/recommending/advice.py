@@ -22,14 +22,12 @@ from hybrid_opt.robust.force import HOLDS, BoxMotion, RobustModel, robust_model,
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import Margin
 from symbolic.array import Array
+from symbolic.contact.registry import contact_model
 from symbolic.records import Contact, Workcell
 from symbolic.records.poses import box_rotation
 from symbolic.records.task import POSE_SIZE, components
 
 MARGIN_BISECTIONS = 20
-
-LARGER_CUP = 5e-3
-"""Growth of the radius of cups whose effect is stated [m]."""
 
 MILLIMETRE = 1e-3
 
@@ -185,8 +183,8 @@ def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str
     """Yield small changes of the cell as text, each with the resulting change of the largest
     commanded force along a motion [N], negative if the force falls.
 
-    If all contacts are suction cups, larger cups are among the changes. They also hold more, so the
-    force of the changed cell is divided by the ratio of their holding force to the present one.
+    Hands that hold more are worth more force: the force of the changed cell is divided by the ratio
+    of its strength (`ContactModel.strength`) to the present one.
 
     Args:
         workcell: the cell.
@@ -203,14 +201,14 @@ def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str
     is_held_at_sides = all(
         abs(each.T_box_pad[:3, 2] @ up) < LARGEST_SIDE_COSINE for each in workcell.contacts
     )
-    if all(contact.kind == "cup" for contact in workcell.contacts):
-        changes[f"cups {2e3 * LARGER_CUP:.0f} mm larger across at the same vacuum"] = _larger
+    changes |= contact_model(workcell).own_changes
     if is_held_at_sides:
         changes["pads 1 mm lower"] = partial(_moved, by=-MILLIMETRE * up)
     for name, change in changes.items():
         other = _with_pads(workcell, change)
         needed = RobustModel(other).commanded(at, doubt, LEADER)
-        yield name, float(needed.max() / _strength(workcell, other) - now.max())
+        stronger = contact_model(other).strength / contact_model(workcell).strength
+        yield name, float(needed.max() / stronger - now.max())
     if is_held_at_sides and abs(height) > LEAST_HEIGHT:
         level = _with_pads(workcell, partial(_moved, by=-height * up))
         needed = RobustModel(level).commanded(motion, doubt, LEADER)
@@ -269,23 +267,6 @@ def _wider(pad: Contact) -> Contact:
         return replace(pad, patch_radius=pad.patch_radius + MILLIMETRE)
     x, y = (side + MILLIMETRE for side in pad.half_sides)
     return replace(pad, patch_radius=float(np.hypot(x, y)), half_sides=(x, y))
-
-
-def _larger(cup: Contact) -> Contact:
-    """Return a suction cup with a radius larger by `LARGER_CUP`; its holding force grows with its
-    area.
-    """
-    radius = cup.patch_radius + LARGER_CUP
-    force = cup.holding_force * (radius / cup.patch_radius) ** 2
-    return replace(cup, patch_radius=radius, holding_force=force)
-
-
-def _strength(workcell: Workcell, other: Workcell) -> float:
-    """Return the ratio of the weakest holding force of `other` to that of `workcell`; 1 for pads,
-    which have no holding force.
-    """
-    own, new = (min(c.holding_force for c in cell.contacts) for cell in (workcell, other))
-    return new / own if own else 1.0
 
 
 def _of_pitch(cell: Cell, path: Array, option: Option, slope: float) -> Iterator[Advice]:

@@ -22,7 +22,7 @@ from scipy.optimize import linprog
 from scipy.sparse import csr_array
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.static_hold import limited_force, mass_at_reference
+from hybrid_opt.static_hold import mass_at_reference
 from hybrid_opt.timing.model import REFINEMENT, SpeedProfile, TimingModel
 from hybrid_opt.timing.records import FRICTION_RATIO, Timing
 from symbolic.array import Array
@@ -98,7 +98,8 @@ class Margin:
 def payload_sensitivity(carry: Carry) -> PayloadSensitivity:
     """Return how the contact forces of a carry depend on the payload mass, at unchanged timing."""
     cell = carry.workcell
-    limited = limited_force(cell, carry.peak_normal_force, carry.peak_resultant_force)
+    forces = carry.peak_normal_force, carry.peak_resultant_force
+    limited = contact_model(cell).limited_force(*forces)
     return PayloadSensitivity(cell.payload.mass, limited, mass_at_reference(cell, limited))
 
 

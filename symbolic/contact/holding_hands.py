@@ -22,8 +22,8 @@ lifts leaks.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
@@ -32,7 +32,14 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.contact.elastic import kern, layer_shares, layer_stiffness
 from symbolic.contact.force_closure import wrench_to_box
-from symbolic.contact.model import ContactLoad, ContactModel, HeldLoad, ImplicitVariables, Problem
+from symbolic.contact.model import (
+    FORCE_FLOOR,
+    ContactLoad,
+    ContactModel,
+    HeldLoad,
+    ImplicitVariables,
+    Problem,
+)
 from symbolic.contact.soft_finger import SoftPatch
 from symbolic.expression import Expression, number
 from symbolic.records import Contact
@@ -61,6 +68,10 @@ to 0.2 %."""
 
 FLOOR = 1e-9
 """Added in squares to forces [N] and moments [N m], so that lengths have derivatives at zero."""
+
+
+LARGER_CUP = 5e-3
+"""Growth of the radius of cups whose effect is stated [m]."""
 
 
 @dataclass(frozen=True)
@@ -201,6 +212,7 @@ class HoldingHands(ContactModel):
     is_squeeze = False
     holders = "hands that hold by themselves"
     order = "hold with"
+    relief = ""
     closing = ("grip_on", "load")
     opening = ("unload", "grip_off")
 
@@ -249,6 +261,28 @@ class HoldingHands(ContactModel):
             ca.DM([contact.friction for contact in contacts]),
         )
         return float(ca.evalf(ca.mmax(self.hold(load).normal)))
+
+    def limited_force(self, normal: Array, whole: Array) -> Array:
+        """Return `normal`: the reference force, which is the holding force, limits the needed
+        holding force (2,) of each arm's hands [N].
+
+        Args:
+            normal: (2,) needed holding force of each arm's hands [N].
+            whole: not used.
+        """
+        return normal
+
+    def friction_use(self, normal: Array, tangential: Array) -> Array:
+        """Compute for n motions the largest tangential force of a hand over the friction of its
+        holding force, (n,).
+
+        Args:
+            normal: not used.
+            tangential: (n, samples, 2) tangential force of each arm's hands as in `hold` [N].
+        """
+        task, contacts = self.workcell.task, self.workcell.contacts
+        bearing = task.reference_force * [contact.friction for contact in contacts]
+        return np.asarray((tangential / bearing).max(axis=(1, 2)))
 
     def hold(
         self,
@@ -304,6 +338,26 @@ class HoldingHands(ContactModel):
             point,
             point - moments[0] - moments[1],
         )
+
+    def squeeze_wrenches(self, leader: int) -> Array:
+        """Return zeros (2, 6) for any leader: more holding force does not press the payload."""
+        return np.zeros((2, 6))
+
+    @property
+    def strength(self) -> float:
+        """Holding force of the weakest hand [N]."""
+        return min(contact.holding_force for contact in self.workcell.contacts)
+
+    @property
+    def own_changes(self) -> dict[str, Callable[[Contact], Contact]]:
+        """Larger cups, if all hands are cups. They also hold more (`strength`)."""
+        if any(contact.kind != "cup" for contact in self.workcell.contacts):
+            return {}
+        return {f"cups {2e3 * LARGER_CUP:.0f} mm larger across at the same vacuum": larger_cup}
+
+    def follower(self, leader: int) -> int | None:
+        """Return None for any leader: hands hold by their own force."""
+        return None
 
     def friction_lost(self, apart: Array) -> Array:
         """Return k zeros: displaced hands lose no friction, because they need no squeeze that a
@@ -366,8 +420,20 @@ class HoldingHands(ContactModel):
     def held_with(self, commanded: Array) -> Array:
         """Return the holding force of the weakest hand [N], repeated to the shape (n, 2) of
         `commanded`. Hands hold by their own force, so the values of `commanded` are not used."""
-        weakest = min(contact.holding_force for contact in self.workcell.contacts)
-        return np.full(commanded.shape, weakest)
+        return np.full(commanded.shape, self.strength)
+
+    def force_use(self, commanded: Array, least: Array) -> dict[str, Array]:
+        """Compute how far needed holding forces use the holding force.
+
+        Args:
+            commanded, least: (n, 2) holding forces needed in every case of the uncertainty, and
+                without uncertainty [N].
+
+        Returns:
+            Ratios (n, 2) of a force to its limit, by name of the limit.
+        """
+        held = np.maximum(self.held_with(commanded), FORCE_FLOOR)
+        return {"holding force": commanded / held} | super().force_use(commanded, least)
 
     def raised(self, planned: Array, extra: Array, leader: int) -> Array:
         """Compute the holding forces (n, 2) [N] after a rise of the force of the robot that does
@@ -411,3 +477,11 @@ class HoldingHands(ContactModel):
             sliding = ca.sqrt(a / friction[i] ** 2 + b / friction[i] + c + FLOOR**2)
             most = ca.fmax(most, own["weaker"] * ca.fmax(sliding, lifting))
         return most
+
+
+def larger_cup(cup: Contact) -> Contact:
+    """Return a suction cup with a radius larger by `LARGER_CUP`; its holding force grows with its
+    area."""
+    radius = cup.patch_radius + LARGER_CUP
+    force = cup.holding_force * (radius / cup.patch_radius) ** 2
+    return replace(cup, patch_radius=radius, holding_force=force)

@@ -11,7 +11,7 @@ derivatives, worst cases and commanded forces follow from it. The program of
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -20,7 +20,7 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.expression import Expression
-from symbolic.records.cell import Uncertainty, Workcell
+from symbolic.records.cell import Contact, Uncertainty, Workcell
 from symbolic.records.quantities import GRAVITY
 
 Problem = tuple[str, str]
@@ -28,6 +28,9 @@ Problem = tuple[str, str]
 
 Both = tuple[Expression, Expression]
 """One value per contact."""
+
+FORCE_FLOOR = 1e-9
+"""Least force of a ratio's denominator [N]."""
 
 
 @dataclass(frozen=True)
@@ -132,10 +135,10 @@ class ContactModel(ABC):
         has_elastic_layers: True if pads are elastic layers (`symbolic.contact.elastic`).
         has_closed_form: True if `hold` computes the forces by formulas, False if they need a convex
             program.
-        is_squeeze: True if the arms press the payload between them. Forces are then commanded, and
-            the reference force of a robot also limits the magnitude of its contact force.
+        is_squeeze: True if the arms press the payload between them. Forces are then commanded.
         holders: description of the pads or hands that commanded forces assume, for messages.
         order: words of the command, as in 'press with 80 N'.
+        relief: what relieves a job that exceeds a limit, besides slower motion; '' for nothing.
         closing: names of the phases of a job in which arms at rest take hold of the payload.
         opening: names of the phases of a job in which arms at rest let go of the payload.
     """
@@ -147,6 +150,7 @@ class ContactModel(ABC):
     is_squeeze: ClassVar[bool] = True
     holders: ClassVar[str] = "pads that press evenly"
     order: ClassVar[str] = "press with"
+    relief: ClassVar[str] = "press less (squeeze)"
     closing: ClassVar[tuple[str, ...]] = ("press",)
     opening: ClassVar[tuple[str, ...]] = ("release",)
 
@@ -184,6 +188,35 @@ class ContactModel(ABC):
         [N]."""
         weight = -self.workcell.payload.mass * GRAVITY[2]
         return float(weight / sum(contact.friction for contact in self.workcell.contacts))
+
+    def limited_force(self, normal: Array, whole: Array) -> Array:
+        """Return for each robot the force (2,) [N] that its reference force limits: for pads the
+        magnitude of the contact force.
+
+        Args:
+            normal: (2,) normal force of each robot [N].
+            whole: (2,) magnitude of each robot's contact force [N].
+        """
+        return whole
+
+    def friction_use(self, normal: Array, tangential: Array) -> Array:
+        """Compute for n motions the largest used share of the friction if both arms hold with their
+        reference forces, (n,).
+
+        The least normal forces of pads use the friction fully, by construction. So the forces N_1
+        and N_2 are raised to the reference force, with their difference kept. The needed friction
+        coefficient is the sum of both tangential forces over N_1 + N_2; the result is its ratio to
+        the smaller coefficient.
+
+        Args:
+            normal, tangential: (n, samples, 2) least normal force, and magnitude of the tangential
+                force, of each robot [N].
+        """
+        difference = np.abs(normal[:, :, 0] - normal[:, :, 1])
+        squeeze = 2.0 * float(self.workcell.task.reference_force.min()) - difference
+        needed = tangential.sum(axis=2) / np.maximum(squeeze, FORCE_FLOOR)
+        use: Array = needed.max(axis=1)
+        return use / min(contact.friction for contact in self.workcell.contacts)
 
     @abstractmethod
     def hold(
@@ -324,6 +357,29 @@ class ContactModel(ABC):
         """
         return planned + np.multiply.outer(extra, self.internal_force_ratio(leader))
 
+    def squeeze_wrenches(self, leader: int) -> Array:
+        """Compute by how much the wrenches of both robots on the payload change per newton by which
+        the force-controlled robot presses harder. Forces of pads with opposite normals then act on
+        one line, midway between the nominal contact points, and cancel.
+
+        Args:
+            leader: index of the robot that is not force-controlled.
+
+        Returns:
+            Change (2, 6) of force [N/N] and moment about the robot's nominal contact point [N m/N],
+            along the axes of the box.
+        """
+        first, second = (contact.T_box_pad for contact in self.workcell.contacts)
+        normal = first[:3, 2]
+        apart = second[:3, 3] - first[:3, 3]
+        beside = (apart - (apart @ normal) * normal) / 2.0
+        return np.array(
+            [
+                np.concatenate([sign * normal, np.cross(sign * beside, sign * normal)])
+                for sign in (1.0, -1.0)
+            ]
+        )
+
     def displacement_margin(self, uncertainty: Uncertainty) -> float:
         """Return by how much the pads' displacement could exceed that of an uncertainty before
         forces can no longer be computed [m]; infinite for a model that allows any displacement.
@@ -335,7 +391,29 @@ class ContactModel(ABC):
         """
         return np.inf
 
+    # --- changes of the cell ---
+
+    @property
+    def strength(self) -> float:
+        """Holding force of the weakest hand [N], by which the forces of changed cells are compared;
+        1 for pads, which have none."""
+        return 1.0
+
+    @property
+    def own_changes(self) -> dict[str, Callable[[Contact], Contact]]:
+        """Small changes of the contacts that only this model knows, by their text in an advice:
+        functions from a pad to its changed copy."""
+        return {}
+
     # --- jobs ---
+
+    def follower(self, leader: int) -> int | None:
+        """Return the index of the force-controlled arm; None if neither arm controls a force.
+
+        Args:
+            leader: index of the arm that keeps its place.
+        """
+        return 1 - leader
 
     def approach(self, arm: int) -> Array:
         """Return the unit direction (3,) in which the pad of arm `arm` approaches the payload, box
@@ -346,6 +424,17 @@ class ContactModel(ABC):
         """Return the normal forces (n, 2) [N] that act on the payload if the forces `commanded` (n,
         2) [N] are commanded. For pads they are equal."""
         return commanded
+
+    def force_use(self, commanded: Array, least: Array) -> dict[str, Array]:
+        """Compute how far the forces of a job use their limits.
+
+        Args:
+            commanded, least: (n, 2) commanded and least normal forces of the robots [N].
+
+        Returns:
+            Ratios (n, 2) of a force to its limit, by name of the limit.
+        """
+        return {"least normal force": least / np.maximum(self.held_with(commanded), FORCE_FLOOR)}
 
     def pulled_apart(self, along: Array, across: Array, stiffness: float) -> tuple[Array, Array]:
         """Compute how the forces change if the arms, as springs in series, are displaced against

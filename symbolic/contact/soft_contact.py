@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 
 from symbolic.array import Array
-from symbolic.contact.force_closure import has_force_closure, least_distance
+from symbolic.contact.force_closure import has_force_closure, least_distance, robot_wrenches
 from symbolic.contact.grasp import Grasp
 from symbolic.contact.grasp_squeeze import GraspSqueeze
 from symbolic.contact.model import ContactLoad, ContactModel, HeldLoad, ImplicitVariables, Problem
@@ -153,8 +153,6 @@ class SoftFingerGrasp(SoftFinger):
 
         Args:
             uncertainty: ranges of the uncertain quantities, pad displacements among them.
-        Compute how far each joint of the pressing arm turns per metre by which its pad moves into
-        the box, along the contact normal.
         """
         off = uncertainty.pad_position + uncertainty.apart / 2.0
         return LARGEST_DISPLACEMENT * least_distance(self.workcell) - off
@@ -176,3 +174,22 @@ class SoftFingerGrasp(SoftFinger):
         """
         normals = Grasp(self.workcell).squeeze_normals()
         return np.asarray(normals / normals[1 - leader])
+
+    def squeeze_wrenches(self, leader: int) -> Array:
+        """Compute by how much the wrenches of both robots on the payload change per newton by which
+        the force-controlled robot presses harder: an internal squeeze within all friction cones.
+
+        Args:
+            leader: index of the robot that is not force-controlled.
+
+        Returns:
+            Change (2, 6) of force [N/N] and moment about the robot's nominal contact point [N m/N],
+            along the axes of the box.
+        """
+        grasp = Grasp(self.workcell)
+        to_robots = robot_wrenches(self.workcell).reshape(6, -1, 6)
+        each = np.einsum("ipj,pj->pi", to_robots, grasp.squeeze_wrenches())
+        parts = np.stack([each[np.array(grasp.robots) == robot].sum(axis=0) for robot in (0, 1)])
+        axes = self.workcell.contacts[0].T_box_pad[:3, :3]
+        wrenches = parts.reshape(2, 2, 3) @ axes.T / grasp.squeeze_normals()[1 - leader]
+        return np.asarray(wrenches.reshape(2, 6))
