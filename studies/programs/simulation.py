@@ -36,12 +36,12 @@ from hybrid_opt.extras.simulation.box import (
     planned_moments,
     workcell_of_case,
 )
+from hybrid_opt.extras.simulation.hand_bodies import HandSprings
 from hybrid_opt.extras.simulation.hands import (
     HAND_SETTINGS,
     HandSimulation,
     hand_threshold,
     own_forces,
-    swing_frequency,
 )
 from hybrid_opt.extras.simulation.reference import (
     Control,
@@ -252,10 +252,8 @@ def simulate_hands(
         options: parsed command line.
     """
     workcell = cell.workcell
-    print(
-        f"  without arms; the payload swings at {swing_frequency(workcell, settings):.1f} Hz on "
-        "layers of rubber"
-    )
+    swings = HandSprings(workcell, settings).swing_frequency
+    print(f"  without arms; the payload swings at {swings:.1f} Hz on layers of rubber")
     found = hand_threshold(carry, settings)
     slips = found.slips
     what = "a rim lifts" if slips.lifts else f"one slips beyond {1e3 * settings.slip:g} mm"

@@ -14,10 +14,10 @@ import numpy as np
 from hybrid_opt.carry import ArmMotion, Carry
 from hybrid_opt.errors import SimulationError
 from hybrid_opt.extras.simulation.box import bisected, carriage_motion
+from hybrid_opt.extras.simulation.hand_bodies import HandSprings
 from hybrid_opt.extras.simulation.hands import (
     HAND_SETTINGS,
     HandSimulation,
-    swing_frequency,
 )
 from hybrid_opt.robust.force import box_motion, interpreted_robust_model
 from studies.research.plain.motion import angular_rates
@@ -96,7 +96,7 @@ def draw(kind: str, rng: np.random.Generator, least_swings: float = SWINGS) -> C
         turned = rng.uniform(-0.4, 0.4, 3) * rng.integers(0, 2)
         path = np.concatenate([rng.uniform(-0.4, 0.4, 3), turned])
         carry = carry_along(workcell, path, rng.uniform(0.8, 1.6))
-        if swing_frequency(workcell) * carry.duration >= least_swings:
+        if HandSprings(workcell, HAND_SETTINGS).swing_frequency * carry.duration >= least_swings:
             return carry
 
 
@@ -142,7 +142,7 @@ def threshold(kind: str, carry: Carry) -> HandThreshold:
     return HandThreshold(
         kind,
         len(workcell.pads),
-        swing_frequency(workcell) * carry.duration,
+        HandSprings(workcell, HAND_SETTINGS).swing_frequency * carry.duration,
         needed,
         rims,
         found.factor,
