@@ -1,105 +1,289 @@
-"""Positions of the joints that move both arms of a machine, chosen once for both arms."""
+"""Holds of both arms of a machine, found together with the joints that move both, such as a torso.
+
+A posture of the whole machine is a vector of the common joints, followed by the other joints of
+either arm. Many postures are computed side by side.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from itertools import product
+from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybrid_opt.extras.proposing.holding import (
+    GUIDES,
     LIMIT_MARGIN,
+    MOST_HOLDS,
+    SAME_REDUNDANT,
     SEARCH_DAMPING,
+    SPIN_OF_FILE,
+    Hold,
     HoldQuery,
+    HoldSearch,
+    clear_spins,
+    initial_arc,
+    limit_room,
+    path_score,
     possible_spins,
 )
-from hybrid_opt.extras.proposing.kinematics import REACHED, ArmKinematics
+from hybrid_opt.extras.proposing.kinematics import (
+    DRIFT_SHARE,
+    JUMP,
+    REACHED,
+    STEP_LIMIT,
+    TRACKING_STEPS,
+    ArmKinematics,
+    pose_error,
+)
 from symbolic.array import Array
 from symbolic.records.poses import box_placement
 
-COMPARED_POSITIONS = 64
-"""Number of random positions that are compared."""
+MACHINE_STARTS = 512
+"""Number of random postures of a machine from which Newton's method reaches for the box at once."""
 
-COMPARED_STARTS = 24
-"""Number of random postures of either arm from which a position is evaluated."""
+MACHINE_ROUNDS = 6
+"""Largest number of such sets of postures."""
 
-REACHING_STEPS = 25
+MACHINE_STEPS = 60
 """Number of Newton steps from these postures."""
 
-MOVED = 4
-"""Number of positions at the start, and at the goal, between which common joints may move."""
+ENOUGH_PAIRS = 12
+"""Number of pairs of holds after which no further set is tried."""
 
-MOVE_COST = 0.05
-"""Cost of moving common joints by a radian or a metre, as a share of reaching postures."""
+WELL_WITHIN = 1e-4
+"""Further distance from joint limits that Newton steps keep, beyond `LIMIT_MARGIN` [rad or m]."""
 
 
-def common_positions(
-    arms: Sequence[ArmKinematics], query: HoldQuery, rng: np.random.Generator
-) -> Iterator[Array | None]:
-    """Yield positions of the joints that move both arms, such as a torso, at the start and at the
-    goal.
+class MachineKinematics:
+    """Numeric kinematics of two arms on common joints.
 
-    The most promising positions come first; the very first are zero, as far as the limits allow.
-    Positions are promising if many random postures of each arm reach the box at both ends, within
-    joint limits and away from singular postures, and if the joints move little.
-
-    Args:
+    Attributes:
         arms: both arms.
-        query: box poses at start and goal, and rotations of the pads to try.
-        rng: generator of positions and postures.
-
-    Yields:
-        (2, k) positions of the k joints at start and goal [rad or m]; None, once, if there are no
-        such joints.
+        common: number of common joints, the first entries of a posture.
+        lower, upper: limits of the entries of a posture [rad or m], with a margin.
+        rest: posture to which Newton steps drift: common joints at zero, others at the middle of
+            their ranges, as far as limits allow [rad or m].
     """
-    if not arms[0].common:
-        yield None
-        return
-    spans = [arm.span[:, arm.common] for arm in arms]
-    low, high = np.maximum(spans[0][0], spans[1][0]), np.minimum(spans[0][1], spans[1][1])
-    held = np.clip(0.0, low, high)
-    yield np.array([held, held])
-    drawn = rng.uniform(low, high, (COMPARED_POSITIONS - 2, len(low)))
-    positions = np.vstack([held, (low + high) / 2.0, drawn])
-    start, goal = (
-        np.min([_reaching(arm, pose, query.spins, positions, rng) for arm in arms], axis=0)
-        for pose in (query.start, query.goal)
-    )
-    ways = {(k, k) for k in range(COMPARED_POSITIONS)}
-    ways |= set(product(np.argsort(-start)[:MOVED].tolist(), np.argsort(-goal)[:MOVED].tolist()))
 
-    def promise(way: tuple[int, int]) -> float:
-        move = float(np.linalg.norm(positions[way[1]] - positions[way[0]]))
-        return float(min(start[way[0]], goal[way[1]])) - MOVE_COST * move
+    def __init__(self, arms: Sequence[ArmKinematics]) -> None:
+        self.arms, self.common = arms, len(arms[0].common)
+        self._own = [np.delete(np.arange(arm.geometry.joints), arm.common) for arm in arms]
+        middle = self.common + len(self._own[0])
+        self._entries = [slice(self.common, middle), slice(middle, middle + len(self._own[1]))]
+        spans = [arm.span for arm in arms]
+        shared = [span[:, arm.common] for span, arm in zip(spans, arms, strict=True)]
+        own = [span[:, joints] for span, joints in zip(spans, self._own, strict=True)]
+        margin = LIMIT_MARGIN + WELL_WITHIN
+        self.lower = np.concatenate([np.maximum(shared[0][0], shared[1][0]), own[0][0], own[1][0]])
+        self.upper = np.concatenate([np.minimum(shared[0][1], shared[1][1]), own[0][1], own[1][1]])
+        self.lower, self.upper = self.lower + margin, self.upper - margin
+        self.rest = (self.lower + self.upper) / 2.0
+        still = slice(0, self.common)
+        self.rest[still] = np.clip(0.0, self.lower[still], self.upper[still])
 
-    ordered = sorted(ways - {(0, 0)}, key=lambda way: (-promise(way), way))
-    found = [way for way in ordered if min(start[way[0]], goal[way[1]]) > 0.0]
-    yield from (positions[list(way)] for way in found)
+    def joints(self, x: Array, arm: int) -> Array:
+        """Return the joint positions (n, joints) of an arm in postures (n, size) [rad or m]."""
+        q = np.empty((len(x), self.arms[arm].geometry.joints))
+        q[:, self.arms[arm].common] = x[:, : self.common]
+        q[:, self._own[arm]] = x[:, self._entries[arm]]
+        return q
+
+    def drawn(self, count: int, rng: np.random.Generator) -> Array:
+        """Draw random postures (count, size) [rad or m]: common joints between their rest and a
+        random position, all others uniform between their limits."""
+        x = rng.uniform(self.lower, self.upper, (count, len(self.rest)))
+        x[:, : self.common] += rng.random((count, 1)) * (self.rest - x)[:, : self.common]
+        return x
+
+    def solve(
+        self, x: Array, targets: Sequence[Array], steps: int, damping: float = 0.0
+    ) -> tuple[Array, Array, Array]:
+        """Find postures that put the last joint of both arms at given poses. Joints do not leave
+        their limits.
+
+        Newton steps have least norm; the first ones also drift to the posture `rest`, as far as the
+        poses leave the joints free.
+
+        Args:
+            x: (n, size) initial postures [rad or m].
+            targets: for each arm (n, 4, 4) wanted poses of its last joint in the world.
+            steps: number of Newton steps.
+            damping: damping of the steps far from a solution.
+
+        Returns:
+            Postures (n, size) [rad or m]; residuals (n,) of the worse arm [m, rad]; determinants
+            (2, n) of the Jacobian of each arm's joints that are not redundant [m^3].
+        """
+        x = x.copy()
+        for step in range(steps + 1):
+            J, error, residual, determinant = self._linearised(x, targets)
+            if step == steps:
+                break
+            drift = DRIFT_SHARE * (self.rest - x) * (step < max(1, steps - TRACKING_STEPS))
+            weight = (damping * np.minimum(residual, 1.0) ** 2 + 1e-10)[:, None, None] * np.eye(12)
+            move, free = np.zeros_like(x), np.ones_like(x)
+            for _ in range(2):  # the second time without the joints that would leave their limits
+                own = J * free[:, None]
+                missing = (error - np.einsum("nij,nj->ni", own, drift))[..., None]
+                across = np.linalg.solve(own @ own.transpose(0, 2, 1) + weight, missing)[..., 0]
+                move = drift * free + np.einsum("nji,nj->ni", own, across)
+                beyond = (x <= self.lower) & (move < 0.0) | (x >= self.upper) & (move > 0.0)
+                free[beyond] = 0.0
+            most = np.maximum(np.abs(move).max(axis=1, keepdims=True), STEP_LIMIT)
+            x = np.clip(x + move * (STEP_LIMIT / most), self.lower, self.upper)
+        return x, residual, determinant
+
+    def _linearised(self, x: Array, targets: Sequence[Array]) -> tuple[Array, Array, Array, Array]:
+        """Compute Jacobians (n, 12, size) of both last joints' frames, pose errors (n, 12), and
+        what `solve` returns beside the postures."""
+        n = len(x)
+        J, error = np.zeros((n, 12, len(self.rest))), np.empty((n, 12))
+        residual, determinant = np.zeros(n), np.empty((2, n))
+        for k, arm in enumerate(self.arms):
+            frames, T = arm.chain(self.joints(x, k))
+            own, rows = arm.jacobian(frames, T), slice(6 * k, 6 * k + 6)
+            J[:, rows, : self.common] = own[:, :, arm.common]
+            J[:, rows, self._entries[k]] = own[:, :, self._own[k]]
+            error[:, rows], missing = pose_error(targets[k], T)
+            residual = np.maximum(residual, missing)
+            determinant[k] = np.linalg.det(own[:, :, arm.following])
+        return J, error, residual, determinant
 
 
-def _reaching(
-    arm: ArmKinematics, pose: Array, spins: Array, positions: Array, rng: np.random.Generator
-) -> Array:
-    """Compute the share of an arm's random postures from which Newton's method reaches the box, for
-    given positions of the joints that move both arms.
+def machine_holds(
+    query: HoldQuery, machine: MachineKinematics, rng: np.random.Generator
+) -> tuple[HoldSearch, list[tuple[Hold, Hold]]]:
+    """Find pairs of holds of a machine's arms whose common joints stand where they suit both arms,
+    at the start and at the goal.
+
+    Random postures reach for the box at the start. Those that are free follow it along the guides,
+    with all joints, to the goal; collisions on the way do not count.
 
     Args:
-        arm: the arm.
-        pose: (6,) pose of the box [m, rad].
-        spins: (s,) rotations of the pad about its normal that are tried [rad].
-        positions: (n, k) positions of the k joints that move both arms [rad or m].
+        query: box poses at start and goal, and rotations of the pads to try.
+        machine: both arms on common joints.
         rng: generator of random postures.
 
     Returns:
-        (n,) shares, one for each row of `positions`.
+        Counts that explain a failure; and the pairs of holds.
     """
-    T_world_box = box_placement(arm.workcell.task.orientation, pose)
-    possible = possible_spins(arm.workcell.contacts[arm.arm], spins)
-    targets = np.array([T_world_box @ arm.held(spin) for spin in possible])
-    q = arm.drawn(len(positions) * COMPARED_STARTS, rng)
-    q[:, arm.common] = np.repeat(positions, COMPARED_STARTS, axis=0)
-    found = arm.solve(q, targets[np.arange(len(q)) % len(targets)], REACHING_STEPS, SEARCH_DAMPING)
-    q = found.q + np.vstack([arm.central(row[None, None])[0] for row in found.q])
-    inside = (q >= arm.lower + LIMIT_MARGIN) & (q <= arm.upper - LIMIT_MARGIN)
-    fine = inside.all(axis=1) & (found.residual <= REACHED) & (found.manipulability >= arm.least)
-    return np.asarray(fine.reshape(-1, COMPARED_STARTS).mean(axis=1))
+    search = _MachineSearch(query, machine, rng)
+    for _ in range(MACHINE_ROUNDS):
+        search.round()
+        if len(search.pairs) >= ENOUGH_PAIRS:
+            break
+    return search.found, search.pairs
+
+
+class _MachineSearch:
+    """The search for pairs of holds of a machine's arms.
+
+    Attributes:
+        found: counts of the search so far.
+        pairs: pairs of holds so far.
+    """
+
+    def __init__(
+        self, query: HoldQuery, machine: MachineKinematics, rng: np.random.Generator
+    ) -> None:
+        self.query, self.rng, self.machine = query, rng, machine
+        self.found, self.pairs = HoldSearch(), list[tuple[Hold, Hold]]()
+        self._known = np.empty((0, 2 * len(self.machine.rest)))
+        arms = machine.arms
+        workcell = arms[0].workcell
+        self._orientation = workcell.task.orientation
+        possible = (possible_spins(workcell.contacts[arm.arm], query.spins) for arm in arms)
+        self._spins = [clear_spins(query, *both) for both in zip(arms, possible, strict=True)]
+        self._held = [
+            np.array([arm.held(spin) for spin in spins])
+            for arm, spins in zip(arms, self._spins, strict=True)
+        ]
+
+    def round(self) -> None:
+        """Add the pairs of holds that one set of random postures leads to."""
+        machine, query = self.machine, self.query
+        which = [self.rng.integers(0, len(spins), MACHINE_STARTS) for spins in self._spins]
+        x = machine.drawn(MACHINE_STARTS, self.rng)
+        x, residual, determinant = machine.solve(
+            x, self._targets(query.start, which), MACHINE_STEPS, SEARCH_DAMPING
+        )
+        fine = (residual <= REACHED) & self._regular(np.abs(determinant))
+        x, which = x[fine], [part[fine] for part in which]
+        self.found.within += len(x)
+        free = ~self._colliding(query.start, x)
+        x, which = x[free], [part[free] for part in which]
+        self.found.free += len(x)
+        for bow in GUIDES[: query.guides]:
+            arrived = self._lead(x, which, initial_arc(query.start, query.goal, bow))
+            x, which = x[~arrived], [part[~arrived] for part in which]
+
+    def _lead(self, x: Array, which: Sequence[NDArray[np.intp]], guide: Array) -> NDArray[np.bool_]:
+        """Follow a guide (m, 6) from postures x (n, size), and add those that arrive.
+
+        Returns:
+            (n,) True for postures that arrive at the goal.
+        """
+        machine = self.machine
+        path, measure = np.tile(x, (len(guide), 1, 1)), np.zeros((2, len(guide), len(x)))
+        alive, side = np.ones(len(x), dtype=bool), np.ones((2, len(x)))
+        kept = np.zeros(len(x), dtype=np.intp)
+        for k, pose in enumerate(guide):
+            before = path[max(k - 1, 0)]
+            path[k], residual, determinant = machine.solve(
+                before, self._targets(pose, which), TRACKING_STEPS
+            )
+            side = np.sign(determinant) if k == 0 else side
+            measure[:, k] = side * determinant
+            alive &= (residual <= REACHED) & self._regular(measure[:, k])
+            alive &= np.abs(path[k] - before).max(axis=1, initial=0.0) <= JUMP
+            kept += alive
+        if kept.max(initial=0) > self.found.kept * len(guide):
+            self.found.kept = float(kept.max()) / len(guide)
+            self.found.stopped = "both arms together do not reach farther in one motion"
+        rows = np.flatnonzero(alive)
+        free = ~self._colliding(self.query.goal, path[-1, rows])
+        for row in rows[free].tolist():
+            ends = np.concatenate([path[0, row], path[-1, row]])
+            if np.abs(self._known - ends).max(axis=1).min(initial=np.inf) > SAME_REDUNDANT:
+                self._known = np.vstack([self._known, ends])
+                self.pairs.append(self._holds(path[:, row], measure[:, :, row], which, row))
+        return alive
+
+    def _holds(
+        self, path: Array, measure: Array, which: Sequence[NDArray[np.intp]], row: int
+    ) -> tuple[Hold, Hold]:
+        """Build the holds of both arms at the ends of a path (m, size) of the machine, along which
+        each arm has the manipulability `measure` (2, m) [m^3]."""
+        found = []
+        for k, arm in enumerate(self.machine.arms):
+            q, spin = self.machine.joints(path, k), float(self._spins[k][which[k][row]])
+            room = limit_room(arm, q[:, None])
+            score = path_score(arm, q[:, None], room, measure[k][:, None])[0]
+            found.append(Hold(spin, q[0], q[-1], float(score + SPIN_OF_FILE * (spin == 0.0))))
+        return found[0], found[1]
+
+    def _targets(self, pose: Array, which: Sequence[NDArray[np.intp]]) -> list[Array]:
+        """Compute the poses (n, 4, 4) of both arms' last joints at a pose (6,) of the box, for the
+        indices `which` of their pads' rotations."""
+        T_world_box = box_placement(self._orientation, pose)
+        return [T_world_box @ held[part] for held, part in zip(self._held, which, strict=True)]
+
+    def _regular(self, measure: Array) -> NDArray[np.bool_]:
+        """Return (n,) True where the manipulability (2, n) of both arms suffices [m^3]."""
+        least = np.array([[arm.least] for arm in self.machine.arms])
+        return np.asarray(np.all(measure >= least, axis=0))
+
+    def _colliding(self, pose: Array, x: Array) -> NDArray[np.bool_]:
+        """Return (n,) True for postures that collide while they hold the box at a pose (6,), and
+        count these collisions by pair of bodies."""
+        judge = self.query.judge
+        if judge is None or not len(x):
+            return np.zeros(len(x), dtype=bool)
+        q_1, q_2 = (self.machine.joints(x, arm) for arm in (0, 1))
+        hit = judge.colliding(np.tile(pose, (len(x), 1)), q_1, q_2)
+        for row in np.flatnonzero(hit)[:MOST_HOLDS].tolist():
+            pair = judge.first_pair(pose, q_1[row], q_2[row])
+            if pair is not None:
+                self.found.pairs[pair] += 1
+        return hit

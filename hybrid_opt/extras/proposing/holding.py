@@ -211,8 +211,8 @@ class HoldQuery:
         judge: checker of collisions; None if collisions do not count.
         starts: number of random starts of the search for postures.
         guides: number of box paths from `GUIDES` that are tried.
-        common: (2, k) positions of the k joints that also move the other arm, at the start and at
-            the goal [rad or m]; None if these joints are free like other redundant joints.
+        common: (k,) positions of the k joints that also move the other arm, which they keep
+            [rad or m]; None if these joints are free like other redundant joints.
     """
 
     start: Array
@@ -287,7 +287,7 @@ class _Finder:
         half = np.where(kinematics.geometry.turning, np.minimum(half, np.pi), half)
         q = centre + half * self.rng.uniform(-1.0, 1.0, (self.query.starts, len(half)))
         if self.query.common is not None:
-            q[:, kinematics.common] = self.query.common[0]
+            q[:, kinematics.common] = self.query.common
         solved = kinematics.solve(q, targets, SEARCH_STEPS, SEARCH_DAMPING)
         good = solved.residual <= REACHED
         q, which, measure = solved.q[good], which[good], solved.manipulability[good]
@@ -392,7 +392,7 @@ class _Finder:
             self._place_common(ends)
         path, kept, measure = kinematics.follow(q, targets, ends)
         path = path + kinematics.central(path)
-        room = self._room(path)
+        room = limit_room(kinematics, path)
         fine = (room >= LIMIT_MARGIN) & (measure >= kinematics.least)
         until = np.where(fine.all(axis=0), len(targets), np.argmin(fine, axis=0))
         share = np.minimum(kept, until)
@@ -405,7 +405,7 @@ class _Finder:
                 where = path[at, farthest], float(measure[at, farthest])
                 self.found.stopped = self._stop(*where, reaches)
         arrived = np.flatnonzero(share == len(targets))
-        return arrived, path, self._score(path, room, measure)
+        return arrived, path, path_score(kinematics, path, room, measure)
 
     def _stop(self, q: Array, measure: float, reaches: bool) -> str:
         """Return the reason why a posture cannot be part of a path.
@@ -441,20 +441,20 @@ class _Finder:
             Indices of the postures that reach the last pose; joint paths (m, n, joints) [rad or m];
             scores (n,), larger is better.
         """
-        ends = None
+        kinematics, ends = self.kinematics, None
         if self.query.common is not None:
-            ends = q[:, list(self.kinematics.redundant)]
+            ends = q[:, list(kinematics.redundant)]
             self._place_common(ends)
-        path, kept, measure = self.kinematics.follow(q, targets, ends, resolved=True)
-        room = self._room(path)
+        path, kept, measure = kinematics.follow(q, targets, ends, resolved=True)
+        room = limit_room(kinematics, path)
         self.found.kept = max(self.found.kept, float(kept.max(initial=0)) / len(targets))
-        fine = (room[-1] >= LIMIT_MARGIN) & (measure[-1] >= self.kinematics.least)
+        fine = (room[-1] >= LIMIT_MARGIN) & (measure[-1] >= kinematics.least)
         arrived = np.flatnonzero((kept == len(targets)) & fine)
-        return arrived, path, self._score(path, room, measure)
+        return arrived, path, path_score(kinematics, path, room, measure)
 
     def _place_common(self, ends: Array) -> None:
-        """Set the goal positions of those redundant joints that also move the other arm to the
-        positions that the query prescribes. Without prescribed positions nothing changes.
+        """Set the redundant joints that also move the other arm to the positions that the query
+        prescribes. Without prescribed positions nothing changes.
 
         Args:
             ends: (n, redundant) positions of the redundant joints at the goal [rad or m], changed
@@ -462,34 +462,37 @@ class _Finder:
         """
         if self.query.common is not None:
             columns = [self.kinematics.redundant.index(k) for k in self.kinematics.common]
-            ends[:, columns] = self.query.common[1]
+            ends[:, columns] = self.query.common
 
-    def _room(self, path: Array) -> Array:
-        """Compute the distance (m, n) of each posture from its nearest joint limit [rad or m];
-        negative beyond a limit.
 
-        Args:
-            path: (m, n, joints) n joint paths of m postures each [rad or m].
-        """
-        beyond = np.minimum(path - self.kinematics.lower, self.kinematics.upper - path)
-        return np.asarray(beyond.min(axis=2))
+def limit_room(kinematics: ArmKinematics, path: Array) -> Array:
+    """Compute the distance (m, n) of each posture from its nearest joint limit [rad or m]; negative
+    beyond a limit.
 
-    def _score(self, path: Array, room: Array, measure: Array) -> Array:
-        """Score n joint paths. Paths far from joint limits and singular postures, with ends near
-        each other, score better.
+    Args:
+        kinematics: the arm.
+        path: (m, n, joints) n joint paths of m postures each [rad or m].
+    """
+    return np.asarray(np.minimum(path - kinematics.lower, kinematics.upper - path).min(axis=2))
 
-        Args:
-            path: (m, n, joints) joint paths [rad or m].
-            room: (m, n) distance from the nearest joint limit [rad or m].
-            measure: (m, n) manipulability [m^3].
 
-        Returns:
-            (n,) scores; larger is better.
-        """
-        comfort = np.clip(room.min(axis=0), 0.0, 0.6) / 0.6
-        away = np.minimum(measure.min(axis=0) / (4.0 * self.kinematics.least), 1.0)
-        apart = np.linalg.norm(path[-1] - path[0], axis=1)
-        return np.asarray(comfort + away - LENGTH_COST * apart)
+def path_score(kinematics: ArmKinematics, path: Array, room: Array, measure: Array) -> Array:
+    """Score n joint paths. Paths far from joint limits and singular postures, with ends near each
+    other, score better.
+
+    Args:
+        kinematics: the arm.
+        path: (m, n, joints) joint paths [rad or m].
+        room: (m, n) distance from the nearest joint limit [rad or m].
+        measure: (m, n) manipulability [m^3].
+
+    Returns:
+        (n,) scores; larger is better.
+    """
+    comfort = np.clip(room.min(axis=0), 0.0, 0.6) / 0.6
+    away = np.minimum(measure.min(axis=0) / (4.0 * kinematics.least), 1.0)
+    apart = np.linalg.norm(path[-1] - path[0], axis=1)
+    return np.asarray(comfort + away - LENGTH_COST * apart)
 
 
 def manipulability_hint(kinematics: ArmKinematics, found: str) -> str:

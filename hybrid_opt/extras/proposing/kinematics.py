@@ -186,7 +186,7 @@ class ArmKinematics:
         for step in range(steps + 1):
             frames, T = self.chain(q)
             J = self.jacobian(frames, T)[:, :, self.following]
-            error, residual = _error(target, T)
+            error, residual = pose_error(target, T)
             if step == steps or float(residual.max(initial=0.0)) < REACHED / 10.0:
                 break
             normal = np.einsum("nki,nkj->nij", J, J)
@@ -215,7 +215,7 @@ class ArmKinematics:
         for step in range(TRACKING_STEPS + 1):
             frames, T = self.chain(q)
             J = self.jacobian(frames, T)
-            error, residual = _error(target, T)
+            error, residual = pose_error(target, T)
             if step == TRACKING_STEPS:
                 break
             own = J * moving
@@ -379,7 +379,7 @@ def _turns(axis: Array, angle: Array) -> Array:
     return np.asarray(np.eye(3) + sine * K + (1.0 - cosine) * (K @ K))
 
 
-def _error(target: Array, T: Array) -> tuple[Array, Array]:
+def pose_error(target: Array, T: Array) -> tuple[Array, Array]:
     """Compute wanted poses minus actual poses, for Newton's method.
 
     Args:

@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from itertools import combinations, islice, product
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -15,7 +15,7 @@ import numpy as np
 from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.evaluate.explanation import missing_reach
 from hybrid_opt.extras.proposing.closed_chain import ChainConfiguration, ClosedChain
-from hybrid_opt.extras.proposing.common import common_positions
+from hybrid_opt.extras.proposing.common import MachineKinematics, machine_holds
 from hybrid_opt.extras.proposing.holding import (
     GUIDES,
     SEARCH_DAMPING,
@@ -47,10 +47,8 @@ MOST_PAIRS = 32
 """Number of pairs that are ranked in detail, the best by the scores of both arms."""
 
 ENOUGH_PAIRS = 4
-"""Number of pairs after which no further position of common joints is tried."""
-
-MOST_POSITIONS = 6
-"""Largest number of positions of common joints that are tried."""
+"""Number of pairs of holds with common joints at rest, after which those of the whole machine are
+not searched."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,18 +79,21 @@ class Pair:
 
 
 def ranked_pairs(
-    workcell: Workcell, judge: PoseJudge, holds: Sequence[Sequence[Hold]], ends: tuple[Array, Array]
+    workcell: Workcell,
+    judge: PoseJudge,
+    holds: Iterable[tuple[Hold, Hold]],
+    ends: tuple[Array, Array],
 ) -> list[Pair]:
-    """Combine holds of both arms to pairs in which the arms do not collide at start and goal, the
-    most promising first.
+    """Select pairs of holds in which the arms do not collide at start and goal, the most promising
+    first.
 
     Args:
         workcell: the cell, with chosen redundant joints.
         judge: checker of collisions, without a margin.
-        holds: holds of each arm; joints that move both arms have the same positions in all of them.
+        holds: pairs of holds; joints that move both arms have the same positions in both.
         ends: start and goal pose (6,) of the box [m, rad].
     """
-    scored = [(a.score + b.score, (a, b)) for a in holds[0] for b in holds[1]]
+    scored = [(a.score + b.score, (a, b)) for a, b in holds]
     scored.sort(key=lambda item: -item[0])
     judges = cache(judge.with_margin)
     models = (arm_model(workcell.robots[0]), arm_model(workcell.robots[1]))
@@ -228,15 +229,15 @@ def prepare(
         raise NoHoldError(blocked)
     query = HoldQuery(start, goal, spins, judge)
     arms = [ArmKinematics(workcell, arm) for arm in (0, 1)]
-    pairs: list[Pair] = []
-    tried: list[list[HoldSearch]] = []
-    for common in islice(common_positions(arms, query, rng), MOST_POSITIONS):
-        at = replace(query, common=common)
-        searches = [find_holds(at, arm, rng) for arm in arms]
-        tried.append(searches)
-        pairs += ranked_pairs(workcell, judge, [found.holds for found in searches], (start, goal))
-        if len(pairs) >= ENOUGH_PAIRS:
-            break
+    machine = MachineKinematics(arms) if arms[0].common else None
+    at_rest = query if machine is None else replace(query, common=machine.rest[: machine.common])
+    tried = [[find_holds(at_rest, arm, rng) for arm in arms]]
+    held = product(tried[0][0].holds, tried[0][1].holds)
+    pairs = ranked_pairs(workcell, judge, held, (start, goal))
+    if machine is not None and len(pairs) < ENOUGH_PAIRS:
+        found, moving = machine_holds(query, machine, rng)
+        tried.append([found])
+        pairs += ranked_pairs(workcell, judge, moving, (start, goal))
     if not pairs:
         raise ProposalError(_no_pair(query, judge, max(tried, key=_progress)))
     return Setup(given, workcell, bodies, sorted(pairs, key=lambda pair: -pair.promise))
@@ -246,7 +247,7 @@ def _progress(searches: Sequence[HoldSearch]) -> tuple[float, ...]:
     """Rank results of the search for holds by the less successful arm.
 
     Args:
-        searches: result for each arm.
+        searches: result for each arm, or for both on common joints.
 
     Returns:
         Four numbers of the less successful arm, compared in this order and larger if better: number
@@ -372,27 +373,27 @@ def reach_missing(workcell: Workcell, ends: tuple[Array, Array], spins: Array) -
     return "; ".join(found)
 
 
-def _arm_missing(kinematics: ArmKinematics, search: HoldSearch) -> str:
-    robot = kinematics.workcell.robots[kinematics.arm]
-    names = list(arm_model(robot).names)[1:]
+def _arm_missing(kinematics: ArmKinematics, search: HoldSearch, name: str) -> str:
+    """Return a text on why the arm, or the whole machine called `name`, has no hold."""
     if not search.within:
+        names = list(arm_model(kinematics.workcell.robots[kinematics.arm]).names)[1:]
         joints = ", ".join(names[joint] for joint, _ in search.joints.most_common(TOLD))
         told = f"beyond limits are most often {joints}"
         if search.manipulability or not joints:  # some are within limits
             told = manipulability_hint(kinematics, f"is at most {search.manipulability:.2g} m^3")
-        return f"{robot.name} has no usable posture at the start: {told}"
+        return f"{name} has no usable posture at the start: {told}"
     if not search.free:
         return (
-            f"{robot.name} collides at the start in every posture: {_pairs(search.pairs)}"
+            f"{name} collides at the start in every posture: {_pairs(search.pairs)}"
             f"{_overlap_hint(search.pairs)}"
         )
     if search.pairs and search.kept >= 1.0:
         return (
-            f"{robot.name} collides in every posture that leads from the start to the goal: "
+            f"{name} collides in every posture that leads from the start to the goal: "
             f"{_pairs(search.pairs)}"
         )
     return (
-        f"{robot.name} follows at most {100.0 * search.kept:.0f} % of the way to the goal: "
+        f"{name} follows at most {100.0 * search.kept:.0f} % of the way to the goal: "
         f"{search.stopped}"
     )
 
@@ -404,10 +405,12 @@ def _no_pair(query: HoldQuery, judge: PoseJudge, searches: Sequence[HoldSearch])
     Args:
         query: box poses that the arms have to hold.
         judge: checker of collisions.
-        searches: result of the search for each arm.
+        searches: result of the search for each arm, or one for both arms on common joints.
     """
+    workcell = judge.geometry.workcell
+    names = [robot.name for robot in workcell.robots] if len(searches) > 1 else ["the machine"]
     told = [
-        _arm_missing(ArmKinematics(judge.geometry.workcell, arm), one)
+        _arm_missing(ArmKinematics(workcell, arm), one, names[arm])
         for arm, one in enumerate(searches)
         if not one.holds
     ]

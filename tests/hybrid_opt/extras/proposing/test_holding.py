@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import replace
-from itertools import islice, pairwise
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +24,7 @@ from hybrid_opt.extras.proposing.bases import (
     machine_places,
     shared_room,
 )
-from hybrid_opt.extras.proposing.common import common_positions
+from hybrid_opt.extras.proposing.common import MachineKinematics, machine_holds
 from hybrid_opt.extras.proposing.holding import HoldQuery, clear_spins, find_holds, possible_spins
 from hybrid_opt.extras.proposing.kinematics import ArmKinematics, rotate_about_normal
 from hybrid_opt.extras.proposing.problem import Problem, read_problem
@@ -198,24 +198,31 @@ def test_both_arms_of_a_pair_hold_the_box_with_one_waist(machine: Setup) -> None
 
 
 def test_a_waist_turns_where_the_box_is_beside_the_machine(machine: Setup) -> None:
-    """Compared by the postures that reach; the start and the goal lie at 50 and -50 degrees."""
-    task = machine.workcell.task
+    """The start and the goal lie at 50 and -50 degrees. Pinocchio places the box in both hands."""
+    workcell, task = machine.workcell, machine.workcell.task
     turned = [
         np.array([0.40 * np.cos(a), 0.40 * np.sin(a), 0.85, 0.0, 0.0, a]) for a in (0.9, -0.9)
     ]
-    arms = [ArmKinematics(machine.workcell, arm) for arm in (0, 1)]
+    both = MachineKinematics([ArmKinematics(workcell, arm) for arm in (0, 1)])
     query = HoldQuery(turned[0], turned[1], SPINS, None)
-    found = list(islice(common_positions(arms, query, np.random.default_rng(1)), 4))
-    assert found[0] is not None
-    np.testing.assert_array_equal(found[0], np.zeros((2, 1)))
-    for common in found[1:]:
-        assert common is not None
-        assert common[0, 0] > 0.3
-        assert common[1, 0] < -0.3
-    assert len(task.redundant) == 1
-    rack = load(RACK)
-    alone = [ArmKinematics(rack, arm) for arm in (0, 1)]
-    assert list(common_positions(alone, query, np.random.default_rng(1))) == [None]
+    counts, found = machine_holds(query, both, np.random.default_rng(1))
+    assert counts.within >= len(found) > 4
+    for holds in found:
+        for pose, end in zip(turned, ("q_start", "q_goal"), strict=True):
+            q = [getattr(hold, end) for hold in holds]
+            assert q[0][0] == q[1][0]
+            for arm, hold in enumerate(holds):
+                robot, model = workcell.robots[arm], arm_model(workcell.robots[arm])
+                assert (q[arm] >= robot.position_lower).all()
+                assert (q[arm] <= robot.position_upper).all()
+                data = model.createData()
+                pin.forwardKinematics(model, data, q[arm])
+                target = box_placement(task.orientation, pose) @ both.arms[arm].held(hold.spin)
+                there = robot.T_world_base @ data.oMi[model.njoints - 1].homogeneous
+                np.testing.assert_allclose(there, target, atol=1e-5)
+    waist = np.array([[hold.q_start[0], hold.q_goal[0]] for hold, _ in found])
+    assert np.median(waist[:, 0]) > 0.3
+    assert np.median(waist[:, 1]) < -0.3
 
 
 def test_an_arm_that_comes_near_a_singular_posture_is_told_with_the_key(tmp_path: Path) -> None:
