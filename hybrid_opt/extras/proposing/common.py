@@ -48,7 +48,7 @@ MACHINE_ROUNDS = 6
 MACHINE_STEPS = 60
 """Number of Newton steps from these postures."""
 
-ENOUGH_PAIRS = 12
+ENOUGH_TOGETHER = 12
 """Number of pairs of holds after which no further set is tried."""
 
 WELL_WITHIN = 1e-4
@@ -171,7 +171,7 @@ def machine_holds(
     search = _MachineSearch(query, machine, rng)
     for _ in range(MACHINE_ROUNDS):
         search.round()
-        if len(search.pairs) >= ENOUGH_PAIRS:
+        if len(search.pairs) >= ENOUGH_TOGETHER:
             break
     return search.found, search.pairs
 
