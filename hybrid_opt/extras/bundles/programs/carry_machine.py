@@ -487,8 +487,9 @@ class Machine:
             seen: measured state of both arms.
         """
         limits, s = self.job.limits, self.clock.s
-        # Nothing is lifted, and no job done, by an arm that stands elsewhere.
+        # Nothing is lifted or let go, and no job done, by an arm that stands elsewhere.
         stands = self.job.is_gripped(s) or s in (0.0, self.job.end)
+        stands = stands or (self.job.phase(s) == "release" and not self.job.is_standing)
         most = limits.path / 2.0 if stands else limits.path
         coordinates = []
         direction = 1.0 if self.clock.rate >= 0.0 else -1.0
@@ -500,13 +501,16 @@ class Machine:
             # Where the arm had to be when its posture was measured.
             since = self.clock.rate * seen.age[arm]
             expected = s - direction * self.lag - since
-            # Twice as far behind as is allowed, and a little ahead.
-            far, near = -2.0 * direction * limits.behind, direction * limits.behind / 2.0
+            # Twice as far behind as is allowed, and a little ahead. A slow arm that is late counts
+            # as off its path: the slower it is, the less of its delay is searched.
+            share = self.job.speed(arm, s) / (SLOW * self.job.fastest)
+            behind = limits.behind * (2.0 if share > 1.0 else share)
+            far, near = -direction * behind, direction * limits.behind / 2.0
             at = self.job.coordinate(arm, q, expected, (min(far, near), max(far, near)))
             away = self.job.distance(arm, q, at)
             if away > most:
                 return f"{self._name(arm)} has left its path by up to {1e3 * away:.1f} mm"
-            if self.job.speed(arm, s) > SLOW * self.job.fastest:
+            if share > 1.0:
                 if direction * (expected - at) > limits.behind:
                     late = 1e3 * direction * (expected - at)
                     return f"{self._name(arm)} is {late:.0f} ms behind its reference"

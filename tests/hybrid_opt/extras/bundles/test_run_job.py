@@ -18,7 +18,7 @@ import pytest
 
 from hybrid_opt.extras.bundles.job_file import pad_errors
 from hybrid_opt.extras.bundles.programs.bring_up import BLOCK, FILE, SPEED
-from hybrid_opt.job.compliance import TRACKED
+from hybrid_opt.job.compliance import TRACKED, separation
 from symbolic.array import Array
 from tests.hybrid_opt.extras.bundles import mock_ros
 from tests.hybrid_opt.extras.bundles.bundles import contents
@@ -231,8 +231,10 @@ def test_both_arms_hold_and_press(
     stopped = {"one arm stops": {0}, "the other arm stops": {1}}.get(name, set())
     for arm in (0, 1):
         away = job().distance(arm, world.q(arm).tolist(), s)
-        # What one that stopped by itself is off: as far as is allowed, and the other's stop.
-        most = job().limits.path + 0.5 * job().fastest * (job().limits.quick_stop + 0.1)
+        # One that stopped by itself is off by what is allowed, and by the other's way to its stop.
+        late = job().limits.partner_stop_time
+        fastest = max(job().speed(arm, at) for at in np.linspace(s - late, s, 26))
+        most = job().limits.path + late * fastest
         assert away < (most if arm in stopped else 1e-3), f"{name} at {s}: {away}"
         held = job().effort(arm, "without_gravity", s, 0.0)
         np.testing.assert_allclose(world.effort(arm), held, atol=2.0)
@@ -259,6 +261,46 @@ def test_a_held_job_sets_the_box_down(driver: str, word: str, code: int, tmp_pat
     end = job().end if word == "continue" else 0.0
     np.testing.assert_allclose(column(world, 1)[-1], both(end), atol=1e-4)
     assert np.abs(np.diff(column(world, 1), axis=0)).max() < 0.02, "no arm jumps"
+
+
+@pytest.mark.parametrize(
+    ("phase", "share"),
+    [
+        ("lift", 0.3),
+        ("set_down", 0.1),
+        *(
+            pytest.param(phase, share, marks=pytest.mark.slow)
+            for phase in ("lift", "carry", "set_down")
+            for share in (0.02, 0.25, 0.5, 0.75, 0.98)
+            if (phase, share) < ("set_down", 0.6)
+        ),
+    ],
+)
+def test_a_box_comes_home_after_one_arm_stopped(phase: str, share: float, tmp_path: Path) -> None:
+    """Also where the arms move slowly: the pads never part by more than the bundle states, and the
+    arms are not too far from their places to go back."""
+    planned = rack_job().phase(phase)
+    when = begins("simulation") + planned.begin + share * planned.duration
+
+    def heal(world: World) -> None:
+        controller, part = world.of(0)
+        controller.stands[part] = False
+        controller.switch(True)
+
+    def prepare(world: World) -> None:
+        world.later(when, lambda: freeze(world, 0))
+        world.later(when + 2.0, lambda: heal(world))
+        world.later(when + 3.0, lambda: world.command("back"))
+
+    code, world = run(contents("torque", "simulation"), tmp_path, prepare)
+    assert code == 3, world.log
+    np.testing.assert_allclose(column(world, 1)[-1], both(0.0), atol=1e-4)
+    time = column(world, 0) - column(world, 0)[0]
+    along, across = pad_errors(
+        rack_job().workcell, column(world, 1)[(time > when) & (time < when + 2.0)]
+    )
+    stated = separation(rack_job(), job().limits.partner_stop_time)
+    assert np.hypot(along, across).max() <= stated
 
 
 def elsewhere(world: World) -> None:
