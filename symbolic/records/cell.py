@@ -414,7 +414,7 @@ class Handling:
     stand_off: Annotated[float, quantity.STAND_OFF] = 0.05
     pressing_speed: Annotated[float, quantity.SPEED] = 0.05
     pressing_rate: Annotated[float, quantity.FORCE_RATE] = 100.0
-    lifting_speed: Annotated[float, quantity.SPEED] = 0.1
+    lifting_speed: Annotated[float, quantity.SPEED] = 0.05
     lift_height: Annotated[float, quantity.LIFT] | None = None
     set_down_height: Annotated[float, quantity.LIFT] | None = None
     partner_stop: Annotated[float, quantity.SEPARATION] | None = None

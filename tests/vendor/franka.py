@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import json
 import multiprocessing as mp
+import os
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -123,9 +124,9 @@ HANDLING = Handling(lift_height=0.02, set_down_height=0.02)
 """The carry begins and ends above the supports of the scene."""
 
 
-def bundle(handling: Handling = HANDLING) -> tuple[Workcell, Contents]:
+def bundle() -> tuple[Workcell, Contents]:
     """The cell of two Pandas called as FR3, whose links are as long, and its torque bundle."""
-    job = jobs_of("pandas").plan(timed("pandas"), handling=handling)
+    job = jobs_of("pandas").plan(timed("pandas"), handling=HANDLING)
     job = driven(job, replace(DRIVER, lag=0.0))
     names = tuple(tuple(n.replace("panda", "fr3") for n in own) for own in job.joint_names)
     job = replace(job, joint_names=(names[0], names[1]))
@@ -193,12 +194,15 @@ def carry(cell: Workcell, files: Contents, share: float = 1.0, high: float = 0.0
     now = spawn.Array("d", 9, lock=False)
     simulation = spawn.Process(target=simulate, args=(scene, there, now), daemon=True)
     simulation.start()
+    policy, priority = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         assert here.poll(PATIENCE), "franky-sim did not start"
         make = partial(FrankaWorld, hosts=here.recv(), now=now, share=share)
         with TemporaryDirectory() as folder:
             code, world = run(files, Path(folder), make=make)
     finally:
+        # libfranka gives this thread, and what it starts later, the highest real-time priority.
+        os.sched_setscheduler(0, policy, priority)
         here.send("over")
         simulation.join(PATIENCE)
     assert isinstance(world, FrankaWorld)

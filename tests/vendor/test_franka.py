@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cache
 from typing import TYPE_CHECKING
 
@@ -25,11 +24,11 @@ TRACKED = 0.20
 
 
 @cache
-def carried(share: float = 1.0, high: float = 0.0, lifting_speed: float = 0.1) -> Outcome:
+def carried(share: float = 1.0, high: float = 0.0) -> Outcome:
     # franky-sim and pylibfranka are there where these tests are asked for.
-    from tests.vendor.franka import HANDLING, bundle, carry
+    from tests.vendor.franka import bundle, carry
 
-    return carry(*bundle(replace(HANDLING, lifting_speed=lifting_speed)), share, high)
+    return carry(*bundle(), share, high)
 
 
 def test_the_job_is_done_and_pressed_as_commanded() -> None:
@@ -57,7 +56,7 @@ def test_with_half_the_force_the_box_falls() -> None:
 def test_a_box_that_stands_early_is_let_go_there() -> None:
     """The support is 3 mm higher than planned: how hard the arms press then follows from the speed
     at which the box meets it."""
-    found = carried(high=0.003, lifting_speed=0.05)
+    found = carried(high=0.003)
     assert found.code == 0, found.log
     assert "the box stands" in "".join(found.log)
     assert abs(found.box[-1, 2] - found.goal[2] - 0.003) < 0.001
