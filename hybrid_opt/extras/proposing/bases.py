@@ -259,7 +259,7 @@ def _mean_reach(draft: Workcell, at: list[Array]) -> Array:
     rng, reaches = np.random.default_rng(0), []
     for arm in (0, 1):
         kinematics = ArmKinematics(draft, arm)
-        _, T = kinematics.chain(kinematics.drawn(REACH_MEAN_POSTURES, rng))
+        T, _ = kinematics.places(kinematics.drawn(REACH_MEAN_POSTURES, rng))
         own = inverse(draft.robots[arm].T_world_base)
         reaches.append((own @ T.mean(axis=0)[:, 3])[:3] - at[arm])
     return np.asarray((reaches[0] + reaches[1]) / 2.0)

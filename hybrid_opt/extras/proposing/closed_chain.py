@@ -15,11 +15,17 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from hybrid_opt.extras.proposing.holding import LIMIT_MARGIN, Hold
-from hybrid_opt.extras.proposing.kinematics import JUMP, REACHED, TRACKING_STEPS, ArmKinematics
+from hybrid_opt.extras.proposing.kinematics import (
+    JUMP,
+    REACHED,
+    TRACKING_STEPS,
+    ArmKinematics,
+    compiled_newton,
+)
 from hybrid_opt.extras.proposing.trial import PoseJudge
 from symbolic.array import Array
 from symbolic.records import POSE_SIZE, Workcell
-from symbolic.records.poses import box_placement, inverse
+from symbolic.records.poses import box_placement
 
 PATH_STEP = 0.02
 """Distance between configurations that are checked along a path [m], as `distance` measures it."""
@@ -58,65 +64,52 @@ class ChainConfiguration:
 
 
 class _Follower:
-    """Numeric kinematics by Pinocchio of an arm that follows the box with a fixed pad rotation."""
+    """An arm that follows the box with a fixed rotation of its pad."""
 
     def __init__(self, many: ArmKinematics, hold: Hold, model: pin.Model) -> None:
         robot = many.workcell.robots[many.arm]
-        self.name, self.model, self.many = robot.name, model, many
-        self.data = self.model.createData()
-        self.names = list(self.model.names)[1:]
-        self.last = self.model.njoints - 1
+        self.name, self.many = robot.name, many
+        self.names = list(model.names)[1:]
         self.redundant = many.workcell.task.redundant_places[many.arm]
         self.T_box_joint = many.held(hold.spin)
-        self.T_root_world = inverse(robot.T_world_base)
         key = f"robots[{many.arm}].min_manipulability = {robot.min_manipulability:g} m^3"
         self.singular = f"{robot.name} is near a singular posture ({key})"
         self.side = many.side(hold.q_start)
         self.lower, self.upper = many.lower + LIMIT_MARGIN, many.upper - LIMIT_MARGIN
 
-    def close(self, T_world_box: Array, extended: Array, q: Array) -> Array | str:
-        """Find the joint positions near `q` with which the arm holds the box.
+    def follow(self, T_world_box: Array, extended: Array, q: Array) -> tuple[Array, str]:
+        """Follow poses of the box, each from the joint positions before.
 
         Args:
-            T_world_box: (4, 4) pose of the box.
-            extended: (6 + m,) vector of which only the m last entries, the redundant joints [rad or
-                m], are used; the box pose comes from `T_world_box`.
-            q: (joints,) joint positions at a configuration nearby [rad or m].
+            T_world_box: (n, 4, 4) poses of the box.
+            extended: (n, 6 + m) vectors of which only the m last entries, the redundant joints [rad
+                or m], are used; the box poses come from `T_world_box`.
+            q: (joints,) joint positions at a configuration near the first pose [rad or m].
 
         Returns:
-            The joint positions (joints,); or a text that says why there are none.
+            Joint positions (k, joints) [rad or m], of all poses or of those before the first one
+            at which the arm cannot hold the box; and a text that says why it cannot, else ''.
         """
-        target = self.T_root_world @ T_world_box @ self.T_box_joint
-        before, q = q, q.copy()
-        for joint, place in self.redundant:
-            q[joint] = extended[place]
-        for _ in range(CHAIN_NEWTON_STEPS):
-            pin.computeJointJacobians(self.model, self.data, q)
-            here = self.data.oMi[self.last]
-            turn = pin.log3(target[:3, :3] @ here.rotation.T)
-            error = np.concatenate([target[:3, 3] - here.translation, turn])
-            J = pin.getJointJacobian(self.model, self.data, self.last, pin.LOCAL_WORLD_ALIGNED)[
-                :, self.many.following
-            ]
-            if error @ error < CHAIN_RESIDUAL**2:
-                break
-            try:
-                step = np.linalg.solve(J, error)
-            except np.linalg.LinAlgError:
-                return self.singular
-            if np.abs(step).max() > JUMP:
-                return f"{self.name} does not reach"
-            q[self.many.following] += step
-        else:
-            return f"{self.name} does not reach"
-        if np.abs(q - before).max() > JUMP:
-            return f"{self.name} does not reach"
-        beyond = np.flatnonzero((q < self.lower) | (q > self.upper))
-        if len(beyond):
-            return f"{self.name}/{self.names[beyond[0]]} is at its limit"
-        if self.side * np.linalg.det(J) < self.many.least:
-            return self.singular
-        return q
+        joints = [joint for joint, _ in self.redundant]
+        path, end = self.many.compiled.follow(
+            q,
+            T_world_box @ self.T_box_joint,
+            joints,
+            extended[:, [place for _, place in self.redundant]],
+            CHAIN_NEWTON_STEPS,
+            CHAIN_RESIDUAL,
+            JUMP,
+            self.lower,
+            self.upper,
+            self.side,
+            self.many.least,
+        )
+        if len(path) == len(extended):
+            return path, ""
+        singular, at_limit = compiled_newton().SINGULAR, compiled_newton().AT_LIMIT
+        if end >= at_limit:
+            return path, f"{self.name}/{self.names[end - at_limit]} is at its limit"
+        return path, self.singular if end == singular else f"{self.name} does not reach"
 
 
 class ClosedChain:
@@ -155,23 +148,30 @@ class ClosedChain:
             for arm, (hold, model) in enumerate(zip(holds, models, strict=True))
         ]
 
-    def close(self, extended: Array, q: tuple[Array, Array]) -> ChainConfiguration | None:
-        """Return the configuration in which both arms hold the box at a given pose; None if an arm
-        cannot. Collisions are not checked.
+    def followed(
+        self, extended: Array, q: tuple[Array, Array]
+    ) -> tuple[list[ChainConfiguration], bool]:
+        """Follow a path with both arms, up to the first pose at which an arm cannot hold the box.
+        Collisions are not checked.
 
         Args:
-            extended: (6 + m,) box pose [m, rad] followed by the m redundant joints [rad or m].
-            q: joint positions (joints,) of each arm at a configuration nearby [rad or m].
+            extended: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
+            q: joint positions (joints,) of each arm at a configuration near the first pose [rad or
+                m].
+
+        Returns:
+            The configurations, and True if they are all n.
         """
-        T_world_box = box_placement(self._orientation, extended[:POSE_SIZE])
-        found = []
-        for arm, near in zip(self._arms, q, strict=True):
-            closed = arm.close(T_world_box, extended, near)
-            if isinstance(closed, str):
-                self.refused[closed] += 1
-                return None
-            found.append(closed)
-        return ChainConfiguration(extended, (found[0], found[1]))
+        T_world_box = box_placement(self._orientation, extended[:, :POSE_SIZE])
+        (first, why), (second, also) = (
+            arm.follow(T_world_box, extended, near) for arm, near in zip(self._arms, q, strict=True)
+        )
+        count = min(len(first), len(second))
+        if count < len(extended):
+            self.refused[why if len(first) == count else also] += 1
+        joints = zip(first[:count], second[:count], strict=True)
+        found = [ChainConfiguration(extended[k], both) for k, both in enumerate(joints)]
+        return found, count == len(extended)
 
     def close_many(
         self, extended: Array, q: tuple[Array, Array], steps: int = TRACKING_STEPS
@@ -209,21 +209,15 @@ class ClosedChain:
             begin: configuration at the first pose of the path.
             path: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
         """
-        batch: list[ChainConfiguration] = []
-        place: ChainConfiguration | None = begin
-        for extended in path:
-            assert place is not None
-            place = self.close(extended, place.q)
-            self.looked += 1
-            if place is not None:
-                batch.append(place)
-            if place is None or len(batch) == TOGETHER:
-                free = self._free(batch)
-                yield from batch[:free]
-                if place is None or free < len(batch):
-                    return
-                batch = []
-        yield from batch[: self._free(batch)]
+        q = begin.q
+        for k in range(0, len(path), TOGETHER):
+            batch, whole = self.followed(path[k : k + TOGETHER], q)
+            self.looked += len(batch) + (not whole)
+            free = self._free(batch)
+            yield from batch[:free]
+            if not whole or free < len(batch):
+                return
+            q = batch[-1].q
 
     def along_many(
         self, begins: Sequence[ChainConfiguration], paths: Array

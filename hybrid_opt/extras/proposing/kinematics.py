@@ -1,15 +1,19 @@
-"""Kinematics of one arm that holds the box, for many postures side by side in NumPy."""
+"""Kinematics of one arm that holds the box. `newton.cpp` computes places, Jacobians and Newton
+steps."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
 from symbolic.array import Array
+from symbolic.extension import compiled_module
 from symbolic.geometry.bodies import ArmGeometry, arm_geometry
 from symbolic.read.arms import arm_model, common_joints
 from symbolic.records import Contact, Robot, Workcell
@@ -35,6 +39,17 @@ JUMP = 0.5
 
 SAME_PATCH = 1e-6
 """Difference below which patches cover one another [m, and of unit vectors]."""
+
+
+@cache
+def compiled_newton() -> Any:
+    """Return the compiled module of `newton.cpp`. It is the same for every arm and was compiled at
+    installation.
+
+    Raises:
+        BridgeError: it is missing or cannot be loaded.
+    """
+    return compiled_module("hybrid_opt.extras.proposing._newton", "the compiled part of proposals")
 
 
 @dataclass(frozen=True)
@@ -72,6 +87,7 @@ class ArmKinematics:
         lower, upper: (joints,) joint limits [rad or m].
         least: least manipulability of a hold [m^3], `MANIPULABILITY_MARGIN` times the robot's
             `min_manipulability`.
+        compiled: the arm in the compiled module.
     """
 
     def __init__(self, workcell: Workcell, arm: int, geometry: ArmGeometry | None = None) -> None:
@@ -82,6 +98,13 @@ class ArmKinematics:
         self.following = [k for k in range(geometry.joints) if k not in self.redundant]
         self.lower, self.upper = np.asarray(geometry.lower), np.asarray(geometry.upper)
         self.least = workcell.robots[arm].min_manipulability * MANIPULABILITY_MARGIN
+        self.compiled = compiled_newton().Arm(
+            geometry.T_world_root,
+            geometry.origins,
+            geometry.axes,
+            geometry.turning,
+            self.following,
+        )
 
     def moved(self, T_world_root: Array) -> ArmKinematics:
         """Return the same arm with its root, the frame in which the first joint is fixed, at
@@ -120,46 +143,19 @@ class ArmKinematics:
         low, high = self.span
         return rng.uniform(low, high, (count, len(low)))
 
-    def chain(self, q: Array) -> tuple[Array, Array]:
-        """Compute the place of every joint of the arm in the world.
+    def places(self, q: Array) -> tuple[Array, Array]:
+        """Compute pose and Jacobian of the arm's last joint.
 
         Args:
             q: (n, joints) joint positions [rad or m].
 
         Returns:
-            - (n, joints, 6) origin [m] of every joint, followed by its unit axis, world frame.
             - (n, 4, 4) pose of the last joint's frame in the world.
+            - (n, 6, joints) its Jacobian: linear velocity of its origin, then angular velocity,
+              along world axes, per joint velocity [m/rad, 1].
         """
-        n, arm = len(q), self.geometry
-        T = np.broadcast_to(arm.T_world_root, (n, 4, 4))
-        points, axes = np.empty((n, arm.joints, 3)), np.empty((n, arm.joints, 3))
-        for k in range(arm.joints):
-            T = T @ arm.origins[k]
-            moved = np.zeros((n, 4, 4))
-            moved[:, 3, 3] = 1.0
-            axis = arm.axes[k]
-            if arm.turning[k]:
-                moved[:, :3, :3] = _turns(axis, q[:, k])
-            else:
-                moved[:, :3, :3] = np.eye(3)
-                moved[:, :3, 3] = q[:, k, None] * axis
-            points[:, k], axes[:, k] = T[:, :3, 3], T[:, :3, :3] @ axis
-            T = T @ moved
-        return np.concatenate([points, axes], axis=2), T
-
-    def jacobian(self, frames: Array, T: Array) -> Array:
-        """Compute the Jacobian (n, 6, joints) of the last joint's frame: linear velocity of its
-        origin, then angular velocity, along world axes, per joint velocity [m/rad, 1].
-
-        Args:
-            frames: (n, joints, 6) joint origins and axes from `chain`.
-            T: (n, 4, 4) pose of the last joint's frame from `chain`.
-        """
-        points, axes = frames[:, :, :3], frames[:, :, 3:]
-        turning = np.array(self.geometry.turning)[:, None]
-        across = np.cross(axes, T[:, None, :3, 3] - points)
-        linear = np.where(turning, across, axes)
-        return np.concatenate([linear, np.where(turning, axes, 0.0)], axis=2).transpose(0, 2, 1)
+        T, jacobian = self.compiled.places(q)
+        return T, jacobian
 
     def side(self, q: Array) -> float:
         """Return the sign of the determinant of the six non-redundant joints' Jacobian. A path
@@ -168,9 +164,7 @@ class ArmKinematics:
         Args:
             q: (joints,) posture [rad or m].
         """
-        return float(
-            np.sign(np.linalg.det(self.jacobian(*self.chain(q[None]))[0][:, self.following]))
-        )
+        return float(np.sign(np.linalg.det(self.places(q[None])[1][0][:, self.following])))
 
     def solve(self, q: Array, target: Array, steps: int, damping: float = 0.0) -> Postures:
         """Find postures that put the last joint at given poses, by Newton's method. Redundant
@@ -182,20 +176,8 @@ class ArmKinematics:
             steps: largest number of Newton steps.
             damping: 0 for pure Newton steps; small values stabilise starts far from a solution.
         """
-        q = np.array(q, dtype=float)
-        for step in range(steps + 1):
-            frames, T = self.chain(q)
-            J = self.jacobian(frames, T)[:, :, self.following]
-            error, residual = pose_error(target, T)
-            if step == steps or float(residual.max(initial=0.0)) < REACHED / 10.0:
-                break
-            normal = np.einsum("nki,nkj->nij", J, J)
-            normal += (damping * np.minimum(residual, 1.0) ** 2 + 1e-12)[:, None, None] * np.eye(6)
-            right = np.einsum("nki,nk->ni", J, error)[..., None]
-            move = np.linalg.solve(normal, right)[..., 0]
-            most = np.maximum(np.abs(move).max(axis=1, keepdims=True), STEP_LIMIT)
-            q[:, self.following] += move * (STEP_LIMIT / most)
-        return Postures(q, residual, np.linalg.det(J))
+        found = self.compiled.solve(q, target, steps, damping, REACHED / 10.0, STEP_LIMIT)
+        return Postures(*found)
 
     def track(self, q: Array, target: Array, held: Sequence[int] = ()) -> Postures:
         """Find the postures near q that put the last joint at given poses. All joints move,
@@ -209,23 +191,10 @@ class ArmKinematics:
             target: (n, 4, 4) wanted poses of the last joint in the world.
             held: indices of the joints that do not move.
         """
-        q = np.array(q, dtype=float)
         middle = (self.lower + self.upper) / 2.0
-        moving = np.isin(np.arange(q.shape[1]), held, invert=True)
-        for step in range(TRACKING_STEPS + 1):
-            frames, T = self.chain(q)
-            J = self.jacobian(frames, T)
-            error, residual = pose_error(target, T)
-            if step == TRACKING_STEPS:
-                break
-            own = J * moving
-            inverted = own.transpose(0, 2, 1) @ np.linalg.inv(
-                own @ own.transpose(0, 2, 1) + 1e-9 * np.eye(6)
-            )
-            drift = DRIFT_SHARE * (middle - q) * moving if step == 0 else np.zeros_like(q)
-            missing = error - np.einsum("nij,nj->ni", own, drift)
-            q += drift + np.einsum("nij,nj->ni", inverted, missing)
-        return Postures(q, residual, np.linalg.det(J[:, :, self.following]))
+        moving = np.isin(np.arange(q.shape[1]), held, invert=True).astype(float)
+        steps = TRACKING_STEPS, moving, middle, DRIFT_SHARE
+        return Postures(*self.compiled.track(q, target, *steps))
 
     def follow(
         self, q: Array, targets: Array, ends: Array | None = None, resolved: bool = False
@@ -365,18 +334,6 @@ def has_wrist_spin(kinematics: ArmKinematics) -> bool:
     parallel = abs(float(T_joint_pad[:3, 2] @ axis)) > 1.0 - 1e-6
     last_follows = geometry.joints - 1 not in kinematics.redundant
     return bool(geometry.turning[-1] and last_follows and parallel and np.linalg.norm(aside) < 1e-4)
-
-
-def _turns(axis: Array, angle: Array) -> Array:
-    """Compute rotation matrices (n, 3, 3) about one axis.
-
-    Args:
-        axis: (3,) unit axis.
-        angle: (n,) angles [rad].
-    """
-    K = np.array([[0.0, -axis[2], axis[1]], [axis[2], 0.0, -axis[0]], [-axis[1], axis[0], 0.0]])
-    sine, cosine = np.sin(angle)[:, None, None], np.cos(angle)[:, None, None]
-    return np.asarray(np.eye(3) + sine * K + (1.0 - cosine) * (K @ K))
 
 
 def pose_error(target: Array, T: Array) -> tuple[Array, Array]:

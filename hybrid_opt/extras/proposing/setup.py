@@ -309,7 +309,7 @@ def redundant_joints(workcell: Workcell, arm: int, common: tuple[str, ...]) -> t
     forced = [*held, *sliding][:beyond]
     kinematics = ArmKinematics(workcell, arm)
     q = kinematics.drawn(POSTURES, np.random.default_rng(0))
-    jacobian = kinematics.jacobian(*kinematics.chain(q))
+    _, jacobian = kinematics.places(q)
 
     def condition(joints: tuple[int, ...]) -> float:
         rest = [k for k in range(model.nq) if k not in joints]

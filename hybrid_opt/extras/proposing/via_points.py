@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 
 import numpy as np
@@ -188,8 +188,8 @@ def shorten_spline(
 
     lever = metric_weights(waypoints.shape[1])
     basis = path_basis(len(waypoints), np.linspace(0.0, 1.0, MEASURED)).position
-    places = list(_closed_path(chain, start, basis @ waypoints))
-    if len(places) < MEASURED:
+    places, whole = chain.followed(basis @ waypoints, start.q)
+    if not whole:
         return waypoints
     shorter: list[tuple[float, Array]] = []
     least = joint_length(places)
@@ -214,27 +214,6 @@ def shorten_spline(
     # All places are looked at in the end: most of these are on the way to a shorter one.
     shorter.sort(key=lambda item: item[0])
     return next((one for _, one in shorter if free_share(chain, start, one) == 1.0), waypoints)
-
-
-def _closed_path(
-    chain: ClosedChain, start: ChainConfiguration, path: Array
-) -> Iterator[ChainConfiguration]:
-    """Yield configurations along a path, up to the first pose at which an arm cannot hold the box.
-    Collisions are ignored.
-
-    Args:
-        chain: both arms, whose pads stay fixed on the box.
-        start: configuration at the first pose.
-        path: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
-    """
-    place: ChainConfiguration | None = start
-    yield start
-    for extended in path[1:]:
-        assert place is not None
-        place = chain.close(extended, place.q)
-        if place is None:
-            return
-        yield place
 
 
 def _lengths(chain: ClosedChain, paths: Array, near: tuple[Array, Array]) -> tuple[Array, Array]:

@@ -62,8 +62,7 @@ def test_placements_and_jacobians_are_pinocchios(rack_cell: Workcell) -> None:
     model = arm_model(rack_cell.robots[0])
     data = model.createData()
     q = np.random.default_rng(0).uniform(-2.0, 2.0, (20, 6))
-    frames, T = kinematics.chain(q)
-    J = kinematics.jacobian(frames, T)
+    T, J = kinematics.places(q)
     base = rack_cell.robots[0].T_world_base
     for k in range(len(q)):
         pin.computeJointJacobians(model, data, q[k])
@@ -73,23 +72,51 @@ def test_placements_and_jacobians_are_pinocchios(rack_cell: Workcell) -> None:
         np.testing.assert_allclose(J[k], turned, atol=1e-13)
 
 
+def test_a_sliding_joint_moves_along_its_axis_and_all_columns_are_slopes(
+    rack_cell: Workcell,
+) -> None:
+    geometry = ArmKinematics(rack_cell, 0).geometry
+    slides = replace(geometry, turning=(True, False, *geometry.turning[2:]))
+    kinematics = ArmKinematics(rack_cell, 0, slides)
+    q, step = np.random.default_rng(2).uniform(-1.0, 1.0, (1, 6)), 1e-6
+    T, J = kinematics.places(q)
+    (forth, _), (back, _) = (kinematics.places(q + sign * step * np.eye(6)) for sign in (1, -1))
+    slope = (forth - back) / (2.0 * step)
+    np.testing.assert_allclose(J[0, :3], slope[:, :3, 3].T, atol=1e-9)
+    turned = slope[:, :3, :3] @ T[0, :3, :3].T  # the skew matrix of the angular velocity
+    np.testing.assert_allclose(J[0, 3], turned[:, 2, 1], atol=1e-9)
+    np.testing.assert_allclose(J[0, 4], turned[:, 0, 2], atol=1e-9)
+    np.testing.assert_allclose(J[0, 5], turned[:, 1, 0], atol=1e-9)
+    far, _ = kinematics.places(q + 0.5 * np.eye(6)[1])
+    np.testing.assert_allclose(far[0, :3, 3] - T[0, :3, 3], 0.5 * J[0, :3, 1], atol=1e-14)
+    np.testing.assert_array_equal(far[0, :3, :3], T[0, :3, :3])
+
+
+def test_arrays_of_other_lengths_are_no_postures(rack_cell: Workcell) -> None:
+    kinematics = ArmKinematics(rack_cell, 0)
+    with pytest.raises(ValueError, match="length"):
+        kinematics.places(np.zeros((2, 5)))
+    with pytest.raises(ValueError, match="length"):
+        kinematics.solve(np.zeros((2, 6)), np.eye(4)[None], 1)
+
+
 def test_newtons_method_comes_back_to_where_placements_are_from(rack_cell: Workcell) -> None:
     kinematics = ArmKinematics(rack_cell, 1)
     rng = np.random.default_rng(1)
     q = rng.uniform(-1.5, 1.5, (50, 6))
-    _, T = kinematics.chain(q)
+    T, _ = kinematics.places(q)
     found = kinematics.solve(q + rng.normal(0.0, 0.02, q.shape), T, 20, 1e-3)
     away = found.manipulability > 0.01
     assert away.sum() > 25
     np.testing.assert_allclose(found.q[away], q[away], atol=1e-5)
-    np.testing.assert_allclose(kinematics.chain(found.q)[1], T, atol=1e-5)
+    np.testing.assert_allclose(kinematics.places(found.q)[0], T, atol=1e-5)
 
 
 def test_following_goes_where_the_joints_came_from(rack_cell: Workcell) -> None:
     kinematics = ArmKinematics(rack_cell, 0)
     begin = np.array([0.2, 0.5, 0.4, 0.3, 0.9, 0.1])
     path = begin + np.linspace(0.0, 0.4, 20)[:, None] * np.array([1, -1, 0.5, 0.2, 0.4, 1.0])
-    _, T = kinematics.chain(path)
+    T, _ = kinematics.places(path)
     found, kept, _ = kinematics.follow(begin[None], T)
     assert kept.tolist() == [20]
     np.testing.assert_allclose(found[:, 0], path, atol=1e-6)
@@ -159,7 +186,7 @@ def test_holds_hold_the_box_at_both_ends(rack_cell: Workcell) -> None:
     assert len(holds) > 1
     for hold in holds:
         for pose, q in zip(ends, (hold.q_start, hold.q_goal), strict=True):
-            T, T_world_box = kinematics.chain(q[None])[1][0], pose_matrix(pose[:3], pose[3:])
+            T, T_world_box = kinematics.places(q[None])[0][0], pose_matrix(pose[:3], pose[3:])
             np.testing.assert_allclose(T, T_world_box @ kinematics.held(hold.spin), atol=1e-5)
 
 
@@ -194,7 +221,7 @@ def test_both_arms_of_a_pair_hold_the_box_with_one_waist(machine: Setup) -> None
             T_world_box = box_placement(task.orientation, pose)
             for arm, hold, q in zip(arms, pair.holds, place.q, strict=True):
                 target = T_world_box @ arm.held(hold.spin)
-                np.testing.assert_allclose(arm.chain(q[None])[1][0], target, atol=1e-5)
+                np.testing.assert_allclose(arm.places(q[None])[0][0], target, atol=1e-5)
 
 
 def test_a_waist_turns_where_the_box_is_beside_the_machine(machine: Setup) -> None:

@@ -281,6 +281,26 @@ def shortened_path(setup: Setup, corners: list[ChainConfiguration]) -> list[Chai
     return path
 
 
+def test_a_path_beyond_reach_is_followed_as_far_as_both_arms_hold_the_box(shelf: Setup) -> None:
+    pair = shelf.pairs[0]
+    chain, begin = pair.chain, pair.start
+    path = straight(begin.extended, begin.extended + np.array([0.0, 0.0, 3.0, 0.0, 0.0, 0.0]))
+    before = chain.refused.copy()
+    found, whole = chain.followed(path, begin.q)
+    assert not whole
+    assert 0 < len(found) < len(path)
+    ((reason, count),) = (chain.refused - before).items()
+    assert count == 1
+    assert any(robot.name in reason for robot in shelf.workcell.robots)
+    # Newton's method from there, many poses side by side, ends in the same postures.
+    near = tuple(np.array([place.q[arm] for place in found]) for arm in (0, 1))
+    q, closed = chain.close_many(path[: len(found)], (near[0] + 1e-3, near[1] - 1e-3))
+    assert closed.all()
+    for arm in (0, 1):
+        np.testing.assert_allclose(q[arm], near[arm], atol=1e-5)
+    assert chain.followed(path[: len(found)], begin.q)[1]
+
+
 def test_paths_hold_the_box_with_both_arms_and_are_free(
     shelf: Setup, first: list[ChainConfiguration]
 ) -> None:
@@ -290,7 +310,7 @@ def test_paths_hold_the_box_with_both_arms_and_are_free(
         kinematics = ArmKinematics(shelf.workcell, arm)
         q = np.array([place.q[arm] for place in path])
         T_box_joint = kinematics.held(pair.holds[arm].spin)
-        _, T = kinematics.chain(q)
+        T, _ = kinematics.places(q)
         wanted = np.array([pose_matrix(pose[:3], pose[3:]) @ T_box_joint for pose in poses])
         np.testing.assert_allclose(T, wanted, atol=1e-5)
         assert np.abs(np.diff(q, axis=0)).max() < 0.5
