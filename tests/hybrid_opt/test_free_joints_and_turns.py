@@ -120,7 +120,7 @@ def test_the_polish_lowers_the_forces(turned: Cell) -> None:
     assert polished.objectives.sum(axis=1).min() < front.objectives.sum(axis=1).min()
 
 
-def test_a_timed_carry_turns_as_its_rates_say(turned: Cell, tmp_path: Path) -> None:
+def test_a_timed_carry_turns_as_its_rates_say(turned: Cell) -> None:
     timing = ho.time_path(turned, turned.initial, ho.TimingLimits())
     assert timing.ok
     carry = timing.carry
@@ -130,6 +130,11 @@ def test_a_timed_carry_turns_as_its_rates_say(turned: Cell, tmp_path: Path) -> N
     # The turn about y in all, by the integral of the angular velocity.
     whole = np.trapezoid(carry.angular_velocity[:, 1], carry.time)
     assert whole == pytest.approx(np.pi, abs=0.02)
+
+
+@pytest.mark.slow
+def test_its_job_says_how_the_box_is_turned(turned: Cell, tmp_path: Path) -> None:
+    timing = ho.time_path(turned, turned.initial, ho.TimingLimits())
     ho.export(timing, "data", tmp_path)
     (path,) = (p for p in tmp_path.rglob("job.json") if "box" in json.loads(p.read_text()))
     box = json.loads(path.read_text())["box"]

@@ -241,8 +241,8 @@ def test_nothing_is_shown_when_not_wanted(capsys: pytest.CaptureFixture[str]) ->
 # --- drivable searches of cells that ship, here and in a worker ---
 
 
-QUICK = ("fork", "rack")
-"""Cells that other tests compile as well; the rest takes minutes."""
+QUICK = ("rack",)
+"""The cell that most tests compile as well; the rest takes minutes."""
 
 CELLS = [
     pytest.param(name, marks=() if name in QUICK else pytest.mark.slow)

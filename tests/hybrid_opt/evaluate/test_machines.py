@@ -75,6 +75,7 @@ def agree(workcell: Workcell, fully: bool = True) -> None:
         assert_agrees(found, k, plain(values))
 
 
+@pytest.mark.slow
 def test_six_joints_and_both_arms_in_one_file(tmp_path: Path) -> None:
     agree(cell_of("pr2", tmp_path), fully=False)
 

@@ -28,17 +28,12 @@ from tests.hybrid_opt.extras.bundles.bundles import driven
 from tests.hybrid_opt.job.jobs import planned
 from tests.symbolic.cells import RACK
 
-QUICK = ("fork",)
-"""Of `SHIPPED` what the default run looks at; others compile for minutes. The rack has tests of its
-own."""
-SHIPPED = [
-    pytest.param(path.stem, marks=() if path.stem in QUICK else pytest.mark.slow)
-    for path in sorted(RACK.parent.glob("*.toml"))
-]
+SHIPPED = sorted(path.stem for path in RACK.parent.glob("*.toml"))
 FREE = ("data", "torque")
 """Targets that are nobody's own."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SHIPPED)
 def test_every_cell_that_ships_has_a_job(name: str) -> None:
     """With the forces that a recommendation knows sooner."""

@@ -76,7 +76,7 @@ def test_the_decision_vector_ends_with_the_force_limit() -> None:
 
 
 def test_objectives_are_those_of_time_path_at_the_candidates_force() -> None:
-    x = candidates(4)
+    x = candidates(2)
     found = evaluator().evaluate(x)
     outputs = evaluator().outputs(x)
     for k, row in enumerate(x):

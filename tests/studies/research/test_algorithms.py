@@ -126,6 +126,7 @@ def test_locks_are_a_grid_within_the_bounds(tmp_path: Path) -> None:
     assert len(locks(task, 10)) == 16
 
 
+@pytest.mark.slow
 def test_a_small_comparison(tmp_path: Path) -> None:
     cell = Cell(free_pandas(tmp_path, "initial = 0.1"))
     (one,) = compare(cell, 4, 1, 60, 1)

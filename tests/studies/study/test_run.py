@@ -174,6 +174,7 @@ def test_drivable_fronts_are_polished_as_one_and_others_replica_by_replica(study
     assert drivable.cell.evaluate(union.x).feasible.all()
 
 
+@pytest.mark.slow
 def test_another_wish_needs_no_other_study(
     program_run: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -94,7 +94,7 @@ def odd_cell() -> Workcell:
 # --- against the plain reference ---
 
 
-@pytest.mark.parametrize("half", [6, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("half", [3, pytest.param(100, marks=pytest.mark.slow)])
 def test_candidates_of_the_rack_compiled_interpreted_and_plain(half: int) -> None:
     """The hand-made one, half of the others within the bounds, half within twice their width."""
     model = rack_model()

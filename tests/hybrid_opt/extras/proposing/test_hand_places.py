@@ -80,6 +80,7 @@ def test_a_place_is_read_as_it_was_written(name: str) -> None:
         np.testing.assert_allclose(entry["xyz"], turned.T_box_pad[:3, 3], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_places_come_before_bases() -> None:
     """Without bases no arm is nearer to a side; each place is a problem of its own then."""
     given = read_problem(CUPS)
