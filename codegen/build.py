@@ -6,7 +6,7 @@ and the compiler. Long functions of a text are compiled to object files with key
 cache also stores the keys of all libraries of a set, under a key of the inputs from which the set
 is generated. So a second start of a program generates neither expressions nor C.
 
-Functions over CasADi's SX may be stored as tapes instead (`codegen.tape`), without a compiler.
+Functions over CasADi's SX may be stored as tapes instead (`codegen.native`), without a compiler.
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from threading import Lock
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from codegen.cache import Cache, CacheEntry, key_of, library_version
-from codegen.compiled import CompiledFunction, cannot_load, warn_one_lane
 from codegen.compiler import (
     FLAGS,
     LANE_FLAGS,
@@ -38,8 +37,15 @@ from codegen.compiler import (
 )
 from codegen.errors import CodegenError, FormError
 from codegen.function import NumericFunction, Signature, available_cores
+from codegen.native import (
+    CompiledFunction,
+    Tape,
+    TapeFunction,
+    cannot_load,
+    compiled_tape,
+    warn_one_lane,
+)
 from codegen.parts import CodePart, in_parts
-from codegen.tape import Tape, TapeFunction, compiled_tape
 
 if TYPE_CHECKING:
     import casadi as ca

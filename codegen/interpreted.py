@@ -1,7 +1,7 @@
 """Evaluation of CasADi functions without compilation, as a reference for compiled functions.
 
 The interpreter also replaces compilation if a function is evaluated so few times that compiling it
-would take longer. A scalar function (type SX) then runs from its tape (`codegen.tape`).
+would take longer. A scalar function (type SX) then runs from its tape (`codegen.native`).
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from codegen.build import compile_function
 from codegen.cache import Cache
 from codegen.errors import CodegenError
 from codegen.function import NumericFunction, Signature
+from codegen.native import Tape, TapeFunction
 from codegen.source import dense
-from codegen.tape import Tape, TapeFunction
 from symbolic.array import Array
 
 AGREEMENT_TOLERANCE = 1e-10

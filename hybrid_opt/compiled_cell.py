@@ -123,7 +123,8 @@ class CompiledCell:
         asked = [self.screening[f"{block}clearance"] for block in geometry.asked]
 
         def bounds(poses: Array, q_1: Array, q_2: Array) -> Array:
-            return geometry.of_active([f.batch(poses, q_1, q_2)["clearance"] for f in asked])
+            parts = [function.batch(poses, q_1, q_2)["clearance"] for function in asked]
+            return np.column_stack(parts).take(geometry.columns, axis=1)
 
         def poses(waypoints: Array) -> Array:
             return found["poses"](waypoints)["poses"]

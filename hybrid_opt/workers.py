@@ -12,13 +12,11 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-import sys
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, as_completed
-from contextlib import AbstractContextManager, contextmanager, suppress
-from functools import lru_cache
+from contextlib import contextmanager, suppress
 from multiprocessing import forkserver, resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
@@ -26,9 +24,8 @@ from threading import Thread, current_thread, main_thread
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
-from threadpoolctl import ThreadpoolController
-
 from codegen.function import available_cores
+from codegen.native import one_thread
 from hybrid_opt.errors import WorkerError
 from symbolic.errors import DualArmError
 
@@ -223,30 +220,6 @@ def call_safely(function: Callable[[Argument], Result], argument: Argument) -> R
         raise DualArmError(str(error)) from None
     except Exception:
         raise RuntimeError(traceback.format_exc()) from None
-
-
-def one_thread() -> AbstractContextManager[object]:
-    """Limit linear algebra to one thread within a `with` block.
-
-    The workers already fill the cores, and on small matrices several threads would wait for one
-    another: without the limit a drivable front of two attempts took 18.4 core-seconds instead of
-    9.3.
-    """
-    limited: AbstractContextManager[object]
-    limited = _controller(len(sys.modules)).limit(limits=1, user_api="blas")
-    return limited
-
-
-@lru_cache(maxsize=1)
-def _controller(modules: int) -> ThreadpoolController:
-    """Return the controller of the threads of all loaded linear-algebra libraries.
-
-    A new controller takes 4 ms, so it is cached until further modules are loaded.
-
-    Args:
-        modules: number of loaded modules.
-    """
-    return ThreadpoolController()
 
 
 def warm_up(*modules: str) -> None:

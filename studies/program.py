@@ -252,7 +252,7 @@ def _done(name: str, options: argparse.Namespace) -> int:
         name: module and name of the function, such as 'studies.demo.show'.
         options: the parsed options.
     """
-    from hybrid_opt.workers import one_thread
+    from codegen.native import one_thread
 
     module, _, function = name.rpartition(".")
     work = getattr(import_module(module), function)

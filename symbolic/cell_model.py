@@ -209,7 +209,8 @@ def _interpreted(workcell: Workcell, bodies: CellBodies) -> Searches:
 
     def bounds(poses: Array, q_1: Array, q_2: Array) -> Array:
         at, n = (poses.T, q_1.T, q_2.T), len(poses)
-        return geometry.of_active([np.array(function.map(n)(*at)).T for function in asked])
+        parts = [np.array(function.map(n)(*at)).T for function in asked]
+        return np.column_stack(parts).take(geometry.columns, axis=1)
 
     first, second = (
         interpreted_search(workcell, arm, model, own_clearance(bodies.geometry, arm, bounds))

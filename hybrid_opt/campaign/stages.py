@@ -25,6 +25,7 @@ from codegen.build import compiler_of
 from codegen.cache import Cache
 from codegen.compiler import interruptible
 from codegen.errors import CodegenError
+from codegen.native import one_thread
 from hybrid_opt.branches import BranchCompetition, search_branches
 from hybrid_opt.campaign.folder import (
     CampaignFolder,
@@ -47,7 +48,6 @@ from hybrid_opt.evaluate.objectives import force_kind
 from hybrid_opt.job.plan import JobCollisions, JobModel, job_model
 from hybrid_opt.progress import Progress, ShowProgress, as_callback
 from hybrid_opt.store.files import read_record, to_json, write_atomically, write_json
-from hybrid_opt.workers import one_thread
 from symbolic.contact.registry import command_model
 from symbolic.errors import DualArmError
 from symbolic.read.cell import load

@@ -4,6 +4,12 @@ pairs.
 Two bodies collide if FCL finds an intersection, or if their distance is at most the tolerance.
 Bounds and proofs decide only pairs whose distance differs from the tolerance by more than FCL's
 resolution, so they do not change any verdict. Near contact FCL alone decides.
+
+A lower bound of a distance is the gap between both bodies along a direction that Coal's GJK
+algorithm proposes. The bound never exceeds the distance, even if the algorithm does not converge;
+if it converges, the bound is within 1e-8 m of the distance. An upper bound below zero is minus the
+radius of a ball inside the Minkowski difference, so the bodies intersect at least that deep. The
+distances of FCL may exceed the true ones by tenths of a millimetre; they are not used.
 """
 
 from __future__ import annotations
@@ -12,15 +18,33 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 
+import fcl
 import numpy as np
 from numpy.typing import NDArray
 
 from codegen.function import NumericFunction
-from hybrid_opt.collision.distances import FCL_RESOLUTION, INTERSECTING, OPEN, BodyDistances, Judge
 from hybrid_opt.collision.joint_tables import JointTable, joint_tables
+from hybrid_opt.collision.solids import compiled_distances, fcl_object, shape_table
 from symbolic.array import Array
-from symbolic.geometry.pairs import FAR, CellGeometry
+from symbolic.geometry.bodies import BOX, CollisionBody
+from symbolic.geometry.pairs import CellGeometry
+from symbolic.geometry.pieces import shrunk
 from symbolic.records import PAYLOAD_NAME
+
+INTERSECTING, OPEN, APART = -1, 0, 1
+"""Verdicts of `BodyDistances.decide`: proven to intersect, not proven, proven to be apart."""
+
+FCL_RESOLUTION = 1e-5
+"""Depth of intersection that FCL resolves [m]; ten times its tolerance."""
+
+RESTING_TOLERANCE = 1e-3
+"""Depth to which the payload may penetrate a body that it may rest on [m]."""
+
+PROOF_MARGIN = 5 * FCL_RESOLUTION
+"""Distance, or depth of intersection, from which a pair is decided without FCL [m]."""
+
+MEASURED_TOGETHER = 64
+"""Number of pairs that `CollisionChecker.min_distance` measures in one step."""
 
 
 @dataclass(frozen=True)
@@ -58,16 +82,6 @@ class Verdict:
     def is_free(self) -> bool:
         """True if no sample collides."""
         return self.first_touch is None
-
-
-RESTING_TOLERANCE = 1e-3
-"""Depth to which the payload may penetrate a body that it may rest on [m]."""
-
-PROOF_MARGIN = 5 * FCL_RESOLUTION
-"""Distance, or depth of intersection, from which a pair is decided without FCL [m]."""
-
-MEASURED_TOGETHER = 64
-"""Number of pairs that `CollisionChecker.min_distance` measures in one step."""
 
 
 class CollisionChecker:
@@ -115,10 +129,9 @@ class CollisionChecker:
             pose: (n, 6) box poses [m, rad].
             q_1, q_2: (n, joints) joint positions [rad].
         """
-        parts = [self.functions["clearance"].batch(pose, q_1, q_2)["clearance"]]
-        if FAR in self.geometry.asked:
-            parts.append(self.functions[f"{FAR}clearance"].batch(pose, q_1, q_2)["clearance"])
-        found = self.geometry.of_active(parts)
+        asked = [self.functions[f"{block}clearance"] for block in self.geometry.asked]
+        parts = [function.batch(pose, q_1, q_2)["clearance"] for function in asked]
+        found = np.column_stack(parts).take(self.geometry.columns, axis=1)
         for table in self.tables:
             tabulated = table.look_up((q_1, q_2)[table.robot])
             found[:, table.pair] = np.fmax(found[:, table.pair], tabulated)
@@ -211,7 +224,8 @@ class CollisionChecker:
         asked = [self.functions[f"{block}motion"] for block in self.geometry.asked]
         found = [function.batch(*start, *end) for function in asked]
         chord, bend = (
-            self.geometry.of_active([part[name] for part in found]) for name in ("chord", "bend")
+            np.column_stack([part[name] for part in found]).take(self.geometry.columns, axis=1)
+            for name in ("chord", "bend")
         )
         return chord, bend
 
@@ -398,3 +412,127 @@ class CollisionChecker:
                 if upper[0] <= self.geometry.tolerance[pair] + RESTING_TOLERANCE:
                     found.append((pair, waypoint.lower[:3], allowed.departure))
         return found
+
+
+class BodyDistances:
+    """Distance queries of many pairs of bodies at many poses in one call.
+
+    A query starts from the direction that the previous query of the same pair found, so queries in
+    the order of the samples are fastest. Threads may share one object.
+
+    Attributes:
+        bodies: bodies of the geometry, then the payload shrunk by the resting tolerance.
+        first_piece: (n_bodies + 1,) index of the first piece (convex solid) of each body among all
+            pieces.
+        poses: (n_pieces,) index of each piece's pose in the output of the function `piece_poses`.
+        shrunk_payload: index of the shrunk payload in `bodies`.
+        native: the object of the C++ module; C code passes its `address` to `decide_pair`.
+    """
+
+    def __init__(self, geometry: CellGeometry, resting_tolerance: float) -> None:
+        """Build the shapes of all bodies, and of the payload made smaller, for distance queries.
+
+        Args:
+            geometry: bodies of the workcell.
+            resting_tolerance: distance by which the shrunk payload is smaller on every side [m].
+        """
+        payload = geometry.index(PAYLOAD_NAME)
+        smaller = tuple(shrunk(p, resting_tolerance) for p in geometry.bodies[payload].pieces)
+        resting = CollisionBody("shrunk payload", "payload", BOX, smaller)
+        self.bodies = (*geometry.bodies, resting)
+        self.shrunk_payload = len(geometry.bodies)
+        counts = [len(body.pieces) for body in self.bodies]
+        self.first_piece = np.concatenate([[0], np.cumsum(counts)])
+        self.poses = np.arange(self.first_piece[-1])
+        self.poses[self.first_piece[-2] :] = self.first_piece[payload] + np.arange(len(smaller))
+        shapes = [piece.shape for body in self.bodies for piece in body.pieces]
+        self.native = compiled_distances().Bodies(
+            *shape_table(shapes), self.first_piece, self.poses
+        )
+
+    def bounds(
+        self,
+        placed: Mapping[str, Array],
+        rows: NDArray[np.intp],
+        first: NDArray[np.intp],
+        second: NDArray[np.intp],
+    ) -> tuple[Array, Array]:
+        """Compute lower and upper bounds of the distances of m pairs of bodies.
+
+        Args:
+            placed: outputs of the function `piece_poses` for n samples.
+            rows: (m,) index of the sample of each query.
+            first, second: (m,) indices of the two bodies of each query in `bodies`.
+
+        Returns:
+            Lower and upper bounds (m,) [m]. Both are negative if the bodies intersect. They are
+            -inf and inf at a pose that is not finite.
+        """
+        at = placed["quaternions"], placed["positions"]
+        lower, upper = self.native.distances(*at, rows, first, second)
+        return lower, upper
+
+    def decide(
+        self,
+        placed: Mapping[str, Array],
+        rows: NDArray[np.intp],
+        first: NDArray[np.intp],
+        second: NDArray[np.intp],
+        apart: Array,
+        overlap: Array,
+    ) -> NDArray[np.int8]:
+        """Try to prove for m pairs of bodies that they are apart, or that they intersect.
+
+        Args:
+            placed: outputs of the function `piece_poses` for n samples.
+            rows: (m,) index of the sample of each query.
+            first, second: (m,) indices of the two bodies of each query in `bodies`.
+            apart: (m,) `APART` proves a distance above this value [m].
+            overlap: (m,) `INTERSECTING` proves a depth of intersection above this value [m]. If the
+                value is negative, it proves a distance below minus the value.
+
+        Returns:
+            (m,) `APART`, `INTERSECTING`, or `OPEN` if neither is proven.
+        """
+        at = placed["quaternions"], placed["positions"]
+        found: NDArray[np.int8] = self.native.decide(*at, rows, first, second, apart, overlap)
+        return found
+
+
+class Judge:
+    """FCL objects of every convex solid of the bodies. Each thread needs its own.
+
+    Attributes:
+        calls: number of FCL queries so far.
+    """
+
+    def __init__(self, distances: BodyDistances) -> None:
+        """Create FCL objects of all bodies.
+
+        Args:
+            distances: distance queries, which hold the bodies.
+        """
+        self.calls = 0
+        self._request = fcl.CollisionRequest()
+        self._objects = [[fcl_object(p) for p in body.pieces] for body in distances.bodies]
+        self._poses = np.split(distances.poses, distances.first_piece[1:-1])
+
+    def intersects(self, placed: Mapping[str, Array], sample: int, i: int, j: int) -> bool:
+        """Return True if FCL finds that bodies i and j intersect.
+
+        Args:
+            placed: outputs of the function `piece_poses`.
+            sample: index of the sample in `placed`.
+            i, j: indices of the bodies.
+        """
+        first, second = (self._placed(placed, sample, body) for body in (i, j))
+        self.calls += len(first) * len(second)
+        return any(fcl.collide(a, b, self._request) for a in first for b in second)
+
+    def _placed(
+        self, placed: Mapping[str, Array], sample: int, body: int
+    ) -> list[fcl.CollisionObject]:
+        for item, pose in zip(self._objects[body], self._poses[body], strict=True):
+            item.setQuatRotation(placed["quaternions"][sample, pose].tolist())
+            item.setTranslation(placed["positions"][sample, pose])
+        return self._objects[body]

@@ -15,7 +15,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.collision.distances import compiled_distances, shape_table
+from hybrid_opt.collision.solids import compiled_distances, shape_table
 from symbolic.array import Array
 from symbolic.geometry.bodies import WORLD, ArmGeometry, CollisionBody
 from symbolic.geometry.covers import close_pairs

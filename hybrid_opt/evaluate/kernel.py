@@ -21,12 +21,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from codegen.build import load_or_build_program
-from codegen.compiled import OTHER_COMPILER, thread_pool, warn_one_lane
 from codegen.errors import CodegenError, FormError
 from codegen.function import available_cores
+from codegen.native import OTHER_COMPILER, thread_pool, warn_one_lane
 from hybrid_opt.collision.checker import PROOF_MARGIN, CollisionChecker
-from hybrid_opt.collision.distances import compiled_distances
 from hybrid_opt.collision.joint_tables import CELLS, CELLS_PER_RADIAN, MOST_ANGLE
+from hybrid_opt.collision.solids import compiled_distances
 from hybrid_opt.compiled_cell import CompiledCell
 from symbolic.array import Array
 from symbolic.functions import (

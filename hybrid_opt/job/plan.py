@@ -23,8 +23,12 @@ import numpy as np
 from codegen.function import NumericFunction
 from hybrid_opt.carry import Carry, joints_of
 from hybrid_opt.collision.certify import Certificate, SampledPath, certificates, certify
-from hybrid_opt.collision.checker import RESTING_TOLERANCE, CollisionChecker
-from hybrid_opt.collision.distances import FCL_RESOLUTION, BodyDistances
+from hybrid_opt.collision.checker import (
+    FCL_RESOLUTION,
+    RESTING_TOLERANCE,
+    BodyDistances,
+    CollisionChecker,
+)
 from hybrid_opt.compiled_cell import CACHED_WORKCELLS, CompiledCell, cache_by_workcell
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.motions import (

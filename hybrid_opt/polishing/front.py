@@ -268,7 +268,7 @@ class PolishRun(ABC, Generic[AnyAttempt]):
 def use_one_thread() -> None:
     """Limit IPOPT's linear algebra to one thread, so that it does not wait on cores that other
     workers use; its matrices are too small for threads. Its library is loaded with the first solve,
-    too late for `hybrid_opt.workers.one_thread`."""
+    too late for `codegen.native.one_thread`."""
     for library in Path(casadi.__file__).parent.glob("*openblas*.so*"):
         with suppress(OSError, AttributeError):
             ctypes.CDLL(str(library)).openblas_set_num_threads(1)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from codegen.native import one_thread
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_PAIRS, FORCE_PAIRS, ROBUST_OBJECTIVES
 from hybrid_opt.polishing.cell import PolishFunctions, SmoothCell, polish_functions
@@ -19,7 +20,6 @@ from hybrid_opt.polishing.front import ParetoArchive, PolishRun
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.workers import one_thread
 from symbolic.array import Array
 from symbolic.contact.registry import command_model
 from symbolic.errors import SettingsError

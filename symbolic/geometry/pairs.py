@@ -117,7 +117,8 @@ class CellGeometry:
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:
-        """(n_active,) index of each active pair among the possible pairs."""
+        """(n_active,) index of each active pair among the possible pairs, which are the columns of
+        the compiled functions named in `asked`, one function after the other."""
         places = {pair: k for k, pair in enumerate(self.possible)}
         return np.array([places[pair] for pair in self.active], dtype=np.intp)
 
@@ -127,17 +128,6 @@ class CellGeometry:
         and `FAR` if any of the other pairs is active."""
         blocks = self.blocks.items()
         return tuple(b for b, pairs in blocks if not b or np.isin(self.columns, pairs).any())
-
-    def of_active(self, bounds: Sequence[Array]) -> Array:
-        """Select the bounds (n, n_active) of the active pairs.
-
-        Args:
-            bounds: bounds (n, n_block) of each function named in `asked`, in the same order.
-        """
-        sizes = [len(self.blocks[block]) for block in self.asked]
-        parts = [each.reshape(len(each), n) for each, n in zip(bounds, sizes, strict=True)]
-        whole = parts[0] if len(parts) == 1 else np.hstack(parts)
-        return np.asarray(whole.take(self.columns, axis=1))
 
     @cached_property
     def pair_names(self) -> tuple[tuple[str, str], ...]:

@@ -18,10 +18,10 @@ import pytest
 from codegen import compiler, parts
 from codegen.build import build, compile_function, load_or_build, load_or_compile
 from codegen.cache import Cache
-from codegen.compiled import CompiledFunction
 from codegen.compiler import find_compiler
 from codegen.errors import CodegenError
 from codegen.function import Signature
+from codegen.native import CompiledFunction
 from codegen.parts import PIECE, in_parts, in_pieces
 from codegen.source import c_source, dense, generated_c, handwritten_source
 from tests.codegen.samples import ASKED, odd_compiler, square

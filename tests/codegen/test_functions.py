@@ -18,7 +18,6 @@ from hypothesis import strategies as st
 
 from codegen.build import compile_function
 from codegen.cache import Cache
-from codegen.compiled import CompiledFunction
 from codegen.errors import CodegenError
 from codegen.function import NumericFunction
 from codegen.interpreted import (
@@ -27,6 +26,7 @@ from codegen.interpreted import (
     directional_derivative,
     relative_difference,
 )
+from codegen.native import CompiledFunction
 from symbolic.array import Array
 from tests.codegen.samples import random_function, small
 from tests.refusals import refused

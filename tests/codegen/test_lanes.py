@@ -10,12 +10,12 @@ import casadi as ca
 import numpy as np
 import pytest
 
-from codegen import compiled as compiled_module
+from codegen import native
 from codegen.build import build, compile_function, load_or_build, load_or_build_program
 from codegen.cache import Cache
-from codegen.compiled import CompiledFunction
 from codegen.errors import FormError, SlowerWarning
 from codegen.lanes import FORMS, KEPT_FORMS, lane_text
+from codegen.native import CompiledFunction
 from symbolic.array import Array
 from tests.codegen.samples import odd_compiler, random_function
 
@@ -126,7 +126,7 @@ def test_what_has_no_form_in_lanes_is_told(cache: Cache, monkeypatch: pytest.Mon
     finder = ca.rootfinder("finder", "fast_newton", {"x": x, "p": p, "g": x**2 - p})
     q = ca.MX.sym("q")
     function = ca.Function("root", [q], [finder(x0=1.0, p=q)["x"]], ["q"], ["root"])
-    monkeypatch.setattr(compiled_module, "_warned", False)
+    monkeypatch.setattr(native, "_warned", False)
     with pytest.warns(RuntimeWarning, match="lanes=1"):
         made = compile_function(function, cache, lanes=0)
     assert made.lanes == 1
@@ -162,7 +162,7 @@ def test_wrong_code_of_lanes_is_not_used(
     wrong = "s/lanes_sq(lanes_real x) { return x \\* x; }/lanes_sq(lanes_real x) { return x + x; }/"
     each = f'case "$file" in *.c) sed -i \'{wrong}\' "$file" ;; esac'
     odd_compiler(tmp_path, monkeypatch, f'for file in "$@"; do {each}; done\nexec gcc "$@"\n')
-    monkeypatch.setattr(compiled_module, "_warned", False)
+    monkeypatch.setattr(native, "_warned", False)
     x = ca.SX.sym("x", 3)
     square = ca.Function("square", [x], [x**2 + ca.sin(x)], ["x"], ["y"])
     cube = ca.Function("cube", [x], [x * x**2], ["x"], ["y"])

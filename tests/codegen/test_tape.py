@@ -13,7 +13,7 @@ import pytest
 from codegen.build import compile_function, load_or_build
 from codegen.cache import Cache
 from codegen.interpreted import InterpretedFunction, interpret
-from codegen.tape import Tape, TapeFunction, compiled_tape
+from codegen.native import Tape, TapeFunction, compiled_tape
 from symbolic.array import Array
 from symbolic.errors import BridgeError
 from tests.refusals import refused

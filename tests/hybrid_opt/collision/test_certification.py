@@ -24,8 +24,7 @@ from hybrid_opt.collision.certify import (
     certify,
     configurations,
 )
-from hybrid_opt.collision.checker import CollidingPair, CollisionChecker
-from hybrid_opt.collision.distances import BodyDistances
+from hybrid_opt.collision.checker import BodyDistances, CollidingPair, CollisionChecker
 from hybrid_opt.evaluate.evaluation import BETWEEN_SAMPLES, REASONS, CandidateEvaluator
 from hybrid_opt.indicators.metrics import non_dominated
 from hybrid_opt.metaheuristics.run import CarryProblem

@@ -14,15 +14,8 @@ import scipy.sparse as sp
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hybrid_opt.collision.checker import PROOF_MARGIN
-from hybrid_opt.collision.distances import (
-    APART,
-    INTERSECTING,
-    OPEN,
-    compiled_distances,
-    fcl_object,
-    shape_table,
-)
+from hybrid_opt.collision.checker import APART, INTERSECTING, OPEN, PROOF_MARGIN
+from hybrid_opt.collision.solids import compiled_distances, fcl_object, shape_table
 from symbolic.array import Array
 from symbolic.geometry.bodies import collision_bodies
 from symbolic.geometry.hulls import hull_of

@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from codegen import compiled as compiled_module
+from codegen import native
 from codegen.errors import SlowerWarning
-from hybrid_opt.collision.distances import FCL_RESOLUTION
+from hybrid_opt.collision.checker import FCL_RESOLUTION
 from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, CandidateEvaluator, Evaluations
 from hybrid_opt.evaluate.explanation import explain, frequent, missing_reach
 from hybrid_opt.evaluate.kernel import (
@@ -166,7 +166,7 @@ def test_a_warm_start_loads_no_slow_library() -> None:
     assert not {"scipy", "trimesh", "pymoo", "matplotlib"} & set(run.stdout.split())
 
 
-@pytest.mark.parametrize("n", [20, pytest.param(230, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("n", [8, pytest.param(230, marks=pytest.mark.slow)])
 def test_screening_changes_no_sample_of_random_candidates(n: int) -> None:
     """Every sample and pair of the carries that a search starts from, against FCL alone."""
     ours = evaluator(RACK)
@@ -343,7 +343,7 @@ def test_forces_that_come_last_are_those_of_one_by_one(lanes: int) -> None:
 
 def test_a_kernel_that_differs_is_not_used(monkeypatch: pytest.MonkeyPatch) -> None:
     ours = fused(RACK)
-    monkeypatch.setattr(compiled_module, "_warned", False)
+    monkeypatch.setattr(native, "_warned", False)
 
     def others(x: Array) -> dict[str, Array]:
         outputs = ours.outputs(x)

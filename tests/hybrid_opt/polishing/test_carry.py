@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from codegen.cache import Cache
 from codegen.interpreted import InterpretedFunction
-from codegen.tape import TapeFunction
+from codegen.native import TapeFunction
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.polishing import cell as cell_module
 from hybrid_opt.polishing.carry import (
