@@ -105,7 +105,7 @@ def _require_own(package: str, member: str) -> None:
 
 
 _require_own("symbolic", "safe_io")
-_require_own("codegen", "compiled")
+_require_own("codegen", "native")
 
 _HOMES = {
     each.name: node.module
