@@ -1,8 +1,8 @@
-"""Conversion of MJCF, MuJoCo's robot descriptions, to URDF: bodies, joints, masses, limits and
-shapes.
+"""Files in MJCF, MuJoCo's format: robots as URDF (bodies, joints, masses, limits, shapes), and the
+fixed bodies of scenes.
 
 MuJoCo's own reader compiles the file, so it handles includes, defaults and angles in degrees. The
-content of the compiled model is written; content that URDF cannot express is refused.
+content of the compiled model is taken; content of a robot that URDF cannot express is refused.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.errors import OutsideError
-from symbolic.read.scene_bodies import slab_below
+from symbolic.read.scene_bodies import SceneBuilder, slab_below
 from symbolic.records import Box, Capsule, Cylinder, Sphere
 from symbolic.records.poses import inverse, rpy_from_rotation, transform
 from symbolic.safe_io import printable
@@ -260,3 +260,45 @@ def _add(
     if pose is not None:
         _add(element, "origin", xyz=pose[:3, 3], rpy=rpy_from_rotation(pose[:3, :3]))
     return element
+
+
+# --- scenes ---
+
+
+def read_mjcf(path: Path, found: SceneBuilder) -> None:
+    """Add the shapes of an MJCF file's world and fixed bodies to `found`, as MuJoCo poses them."""
+    mujoco, _, model = compiled(path)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    moving = dict[int, int]()
+    standing = dict[int, list[str]]()
+    for number in range(model.ngeom):
+        geom = model.geom(number)
+        body = int(geom.bodyid[0])
+        name = f"{model.body(body).name or f'body {body}'} {geom.name}" if body else geom.name
+        name = name.strip() or f"geom {number}"
+        pose = transform(data.geom_xmat[number].reshape(3, 3), data.geom_xpos[number])
+        kind, shape = geom_shape(mujoco, model, number)
+        root, before = int(model.body_rootid[body]), len(found.bodies)
+        if model.body_weldid[body]:
+            moving[root] = moving.get(root, 0) + 1
+        elif not geom.contype[0] and not geom.conaffinity[0]:
+            found.note(name, "is no body, only to be seen: its contype and conaffinity are zero")
+        elif shape is not None:
+            found.add(name, shape, pose)
+        elif kind == "plane":
+            found.plane(name, pose)
+        elif kind == "mesh":
+            mesh = model.mesh(int(geom.dataid[0]))
+            corners = slice(int(mesh.vertadr[0]), int(mesh.vertadr[0] + mesh.vertnum[0]))
+            faces = slice(int(mesh.faceadr[0]), int(mesh.faceadr[0] + mesh.facenum[0]))
+            found.triangles(name, model.mesh_vert[corners], model.mesh_face[faces], pose)
+        else:
+            found.leave(name, f"is of the kind {kind}, which no body is")
+        standing.setdefault(root, []).extend(each.name for each in found.bodies[before:])
+    for root, count in moving.items():
+        name = model.body(root).name or f"body {root}"
+        found.leave(name, f"moves, and has {count} shapes that therefore are no fixed body")
+        if standing[root]:
+            bodies = ", ".join(standing[root])
+            found.note(name, f"remove {bodies} if they are the base of a robot that the cell has")

@@ -19,7 +19,7 @@ from symbolic import safe_io
 from symbolic.array import Array
 from symbolic.errors import OutsideError, SceneError
 from symbolic.read.elements import ElementReader, parse_elements
-from symbolic.read.mjcf import compiled, geom_shape
+from symbolic.read.mjcf import read_mjcf
 from symbolic.read.scene_bodies import (
     ANY,
     WHERE,
@@ -30,7 +30,7 @@ from symbolic.read.scene_bodies import (
 )
 from symbolic.read.tables import TableReader
 from symbolic.records import Box, Capsule, Cylinder, Sphere
-from symbolic.records.poses import inverse, pose_matrix, transform
+from symbolic.records.poses import inverse, pose_matrix
 from symbolic.records.problems import shown, suggestion
 
 SDF_SHAPES = {"box": Box, "sphere": Sphere, "cylinder": Cylinder, "capsule": Capsule}
@@ -565,51 +565,9 @@ def _written_object(name: str, words: Sequence[str], placed: bool, found: SceneB
         numbers(4)  # its colour
 
 
-# --- MJCF ---
-
-
-def _read_mjcf(path: Path, found: SceneBuilder) -> None:
-    """Add the shapes of an MJCF file's world and fixed bodies to `found`, as MuJoCo poses them."""
-    mujoco, _, model = compiled(path)
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    moving = dict[int, int]()
-    standing = dict[int, list[str]]()
-    for number in range(model.ngeom):
-        geom = model.geom(number)
-        body = int(geom.bodyid[0])
-        name = f"{model.body(body).name or f'body {body}'} {geom.name}" if body else geom.name
-        name = name.strip() or f"geom {number}"
-        pose = transform(data.geom_xmat[number].reshape(3, 3), data.geom_xpos[number])
-        kind, shape = geom_shape(mujoco, model, number)
-        root, before = int(model.body_rootid[body]), len(found.bodies)
-        if model.body_weldid[body]:
-            moving[root] = moving.get(root, 0) + 1
-        elif not geom.contype[0] and not geom.conaffinity[0]:
-            found.note(name, "is no body, only to be seen: its contype and conaffinity are zero")
-        elif shape is not None:
-            found.add(name, shape, pose)
-        elif kind == "plane":
-            found.plane(name, pose)
-        elif kind == "mesh":
-            mesh = model.mesh(int(geom.dataid[0]))
-            corners = slice(int(mesh.vertadr[0]), int(mesh.vertadr[0] + mesh.vertnum[0]))
-            faces = slice(int(mesh.faceadr[0]), int(mesh.faceadr[0] + mesh.facenum[0]))
-            found.triangles(name, model.mesh_vert[corners], model.mesh_face[faces], pose)
-        else:
-            found.leave(name, f"is of the kind {kind}, which no body is")
-        standing.setdefault(root, []).extend(each.name for each in found.bodies[before:])
-    for root, count in moving.items():
-        name = model.body(root).name or f"body {root}"
-        found.leave(name, f"moves, and has {count} shapes that therefore are no fixed body")
-        if standing[root]:
-            bodies = ", ".join(standing[root])
-            found.note(name, f"remove {bodies} if they are the base of a robot that the cell has")
-
-
 READERS: dict[str, Callable[[Path, SceneBuilder], None]] = {
     "sdf": lambda path, found: _Sdf(found).read(path),
-    "mujoco": _read_mjcf,
+    "mujoco": read_mjcf,
     ".yaml": _read_moveit,
     ".yml": _read_moveit,
     ".scene": _read_moveit_text,
