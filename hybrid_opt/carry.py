@@ -12,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from codegen.function import NumericFunction
 from hybrid_opt.display_protocol import Displayable, Page, display
@@ -282,6 +283,67 @@ class Carry(Displayable):
         """
         page: Page = display("scene").CarryView(self, height)
         return page
+
+
+@dataclass(frozen=True)
+class BoxMotion:
+    """Box poses and their time derivatives at n samples, world frame.
+
+    Attributes:
+        pose: (n, 6) box poses [m, rad].
+        rate, second_rate: (n, 6) first and second time derivative of the pose.
+    """
+
+    pose: Array
+    rate: Array
+    second_rate: Array
+
+    def at(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> BoxMotion:
+        """Return the motion at some samples, given by indices or by a mask (n,)."""
+        return BoxMotion(self.pose[rows], self.rate[rows], self.second_rate[rows])
+
+
+HeldMotion = BoxMotion | Carry
+"""A motion given by box poses and their time derivatives."""
+
+
+def motion_inputs(motion: HeldMotion) -> tuple[Array, Array, Array]:
+    """Return pose, first and second time derivative (n, 6) of the box along a motion, the inputs of
+    the compiled force functions.
+    """
+    return motion.pose, motion.rate, motion.second_rate
+
+
+def box_motion(motion: HeldMotion) -> BoxMotion:
+    """Return the box poses of a motion and their time derivatives, without the other quantities of
+    a carry.
+    """
+    return BoxMotion(*motion_inputs(motion))
+
+
+def tile_motion(motion: HeldMotion, times: int) -> BoxMotion:
+    """Repeat the samples of a motion several times, one copy after the other.
+
+    Args:
+        motion: motion of n samples.
+        times: number of copies.
+
+    Returns:
+        Motion of times * n samples.
+    """
+    return BoxMotion(*[np.tile(values, (times, 1)) for values in motion_inputs(motion)])
+
+
+def at_rest() -> BoxMotion:
+    """Return a motion of one sample: the box at rest in the world's origin, with its axes along the
+    world's.
+    """
+    return BoxMotion(*[np.zeros((1, 6))] * 3)
+
+
+def at_standstill(motion: HeldMotion) -> BoxMotion:
+    """Return a motion with the same box poses, whose time derivatives are zero."""
+    return BoxMotion(motion.pose, 0.0 * motion.rate, 0.0 * motion.second_rate)
 
 
 def joints_of(workcell: Workcell, values: Array) -> tuple[Array, Array]:

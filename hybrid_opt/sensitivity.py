@@ -21,12 +21,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.carry import Carry
+from hybrid_opt.carry import BoxMotion, Carry
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.display_protocol import Displayable
 from hybrid_opt.progress import ShowProgress, track
 from hybrid_opt.robust.cases import LEADER
-from hybrid_opt.robust.force import BoxMotion
 from hybrid_opt.robust.path_force import GoverningForce
 from hybrid_opt.timing.model import CarryLimits, TimingModel
 from hybrid_opt.timing.records import Timing

@@ -493,8 +493,9 @@ def build_all(makers: Sequence[Maker], progress: Progress) -> list[DualArmError]
 
 def _makers(cell: Cell, polish: bool) -> Iterator[Maker]:
     # Not imported at the top: who builds a few functions needs none of it.
+    from hybrid_opt.carry import at_rest
     from hybrid_opt.polishing.drive import is_polishable
-    from hybrid_opt.robust.force import at_rest, robust_model
+    from hybrid_opt.robust.force import robust_model
     from hybrid_opt.timing.model import TimingModel
     from hybrid_opt.timing.path_timer import PATH_INTERVALS
 

@@ -213,7 +213,8 @@ def _robust_forces(outputs: Outputs, workcell: Workcell) -> Array:
     if "robust_force" in outputs:
         return np.asarray(outputs["robust_force"] / workcell.task.reference_force)
     # Imported here: only this objective needs its compiled functions.
-    from hybrid_opt.robust.force import BoxMotion, robust_model
+    from hybrid_opt.carry import BoxMotion
+    from hybrid_opt.robust.force import robust_model
 
     n, samples = outputs["pose"].shape[:2]
     flat = [outputs[name].reshape(n * samples, 6) for name in ("pose", "rate", "second_rate")]

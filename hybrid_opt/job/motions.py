@@ -19,10 +19,9 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from codegen.function import NumericFunction
-from hybrid_opt.carry import Carry, joints_of
+from hybrid_opt.carry import BoxMotion, Carry, joints_of
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.records import Force, PhaseMotion
-from hybrid_opt.robust.force import BoxMotion
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, extra_normal_force
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits

@@ -15,9 +15,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from codegen.interpreted import interpret
+from hybrid_opt.carry import BoxMotion
 from hybrid_opt.compiled_cell import contact_function
 from hybrid_opt.robust.cases import GoverningCases, governing_cases
-from hybrid_opt.robust.force import BoxMotion, robust_model
+from hybrid_opt.robust.force import robust_model
 from hybrid_opt.robust.path_force import PathPoints, robust_path
 from symbolic.array import Array
 from symbolic.contact.worst_cases import case_gradient_function

@@ -14,11 +14,11 @@ from functools import partial
 
 import numpy as np
 
-from hybrid_opt.carry import Carry
+from hybrid_opt.carry import BoxMotion, Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.recommending.choice import DrivenPaths, Option
 from hybrid_opt.robust.cases import LEADER, nominal_case
-from hybrid_opt.robust.force import HOLDS, BoxMotion, RobustModel, robust_model, subsample
+from hybrid_opt.robust.force import HOLDS, RobustModel, robust_model, subsample
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import Margin
 from symbolic.array import Array

@@ -15,10 +15,11 @@ from typing import Any
 
 import numpy as np
 
+from hybrid_opt.carry import BoxMotion
 from hybrid_opt.cell import Cell
 from hybrid_opt.robust.budget import GripBudget
 from hybrid_opt.robust.cases import LEADER
-from hybrid_opt.robust.force import BoxMotion, robust_model
+from hybrid_opt.robust.force import robust_model
 from hybrid_opt.static_hold import static_hold_error
 from hybrid_opt.timing.records import PathTiming, TimingLimits
 from symbolic.array import Array

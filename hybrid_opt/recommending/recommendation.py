@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.carry import Carry
+from hybrid_opt.carry import Carry, at_rest, box_motion
 from hybrid_opt.cell import Cell
 from hybrid_opt.display_protocol import Displayable
 from hybrid_opt.errors import JobError
@@ -48,7 +48,7 @@ from hybrid_opt.robust.budget import (
     reserve,
 )
 from hybrid_opt.robust.cases import LEADER
-from hybrid_opt.robust.force import at_rest, box_motion, robust_model, subsample
+from hybrid_opt.robust.force import robust_model, subsample
 from hybrid_opt.robust.squeeze import MOST, Squeeze, largest_commanded
 from hybrid_opt.static_hold import static_hold
 from hybrid_opt.timing.records import Timing

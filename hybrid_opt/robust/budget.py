@@ -12,14 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import brentq
 
+from hybrid_opt.carry import BoxMotion, HeldMotion, at_standstill
 from hybrid_opt.robust.cases import LEADER
-from hybrid_opt.robust.force import (
-    BoxMotion,
-    HeldMotion,
-    RobustModel,
-    at_standstill,
-    interpreted_robust_model,
-)
+from hybrid_opt.robust.force import RobustModel, interpreted_robust_model
 from hybrid_opt.robust.squeeze import UNCERTAINTY_SOURCES
 from symbolic.array import Array, Figure, Pair
 from symbolic.errors import SettingsError

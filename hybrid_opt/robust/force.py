@@ -20,21 +20,20 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 
 from codegen.function import NumericFunction
-from hybrid_opt.carry import Carry
-from hybrid_opt.compiled_cell import cache_by_workcell, contact_function
-from hybrid_opt.robust.cases import (
-    governing_cases,
-    nominal_case,
-    random_cases,
-    worst_cases,
+from hybrid_opt.carry import (
+    BoxMotion,
+    Carry,
+    HeldMotion,
+    box_motion,
+    motion_inputs,
+    tile_motion,
 )
+from hybrid_opt.compiled_cell import cache_by_workcell, contact_function
+from hybrid_opt.robust.cases import governing_cases, nominal_case, random_cases, worst_cases
 from symbolic.array import Array, Count, evenly
 from symbolic.contact.model import ContactModel
 from symbolic.contact.registry import command_model
-from symbolic.contact.worst_cases import (
-    case_slack_function,
-    case_squeeze_function,
-)
+from symbolic.contact.worst_cases import case_slack_function, case_squeeze_function
 from symbolic.errors import SettingsError
 from symbolic.records import Uncertainty, Workcell
 
@@ -66,73 +65,9 @@ HOLDS = 1e-6
 """Excess of a needed force over the commanded force that counts as rounding, as a share."""
 
 
-CASES = 100_000
-"""Number of random cases in which every priced carry is checked."""
-
 SAMPLES = 100
 """Number of evenly spread samples of a carry that are evaluated, besides those of its largest
 forces."""
-
-
-@dataclass(frozen=True)
-class BoxMotion:
-    """Box poses and their time derivatives at n samples, world frame.
-
-    Attributes:
-        pose: (n, 6) box poses [m, rad].
-        rate, second_rate: (n, 6) first and second time derivative of the pose.
-    """
-
-    pose: Array
-    rate: Array
-    second_rate: Array
-
-    def at(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> BoxMotion:
-        """Return the motion at some samples, given by indices or by a mask (n,)."""
-        return BoxMotion(self.pose[rows], self.rate[rows], self.second_rate[rows])
-
-
-HeldMotion = BoxMotion | Carry
-"""A motion given by box poses and their time derivatives."""
-
-
-def motion_inputs(motion: HeldMotion) -> tuple[Array, Array, Array]:
-    """Return pose, first and second time derivative (n, 6) of the box along a motion, the inputs of
-    the compiled force functions.
-    """
-    return motion.pose, motion.rate, motion.second_rate
-
-
-def box_motion(motion: HeldMotion) -> BoxMotion:
-    """Return the box poses of a motion and their time derivatives, without the other quantities of
-    a carry.
-    """
-    return BoxMotion(*motion_inputs(motion))
-
-
-def tile_motion(motion: HeldMotion, times: int) -> BoxMotion:
-    """Repeat the samples of a motion several times, one copy after the other.
-
-    Args:
-        motion: motion of n samples.
-        times: number of copies.
-
-    Returns:
-        Motion of times * n samples.
-    """
-    return BoxMotion(*[np.tile(values, (times, 1)) for values in motion_inputs(motion)])
-
-
-def at_rest() -> BoxMotion:
-    """Return a motion of one sample: the box at rest in the world's origin, with its axes along the
-    world's.
-    """
-    return BoxMotion(*[np.zeros((1, 6))] * 3)
-
-
-def at_standstill(motion: HeldMotion) -> BoxMotion:
-    """Return a motion with the same box poses, whose time derivatives are zero."""
-    return BoxMotion(motion.pose, 0.0 * motion.rate, 0.0 * motion.second_rate)
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from codegen.interpreted import interpret
-from hybrid_opt.carry import Carry
+from hybrid_opt.carry import BoxMotion, Carry, box_motion, motion_inputs, tile_motion
 from hybrid_opt.compiled_cell import bound_to, cache_by_workcell, contact_function
 from hybrid_opt.robust.cases import (
     FOLLOWER,
@@ -25,7 +25,7 @@ from hybrid_opt.robust.cases import (
     transmitted_share,
     worst_cases,
 )
-from hybrid_opt.robust.force import BoxMotion, box_motion, motion_inputs, robust_model, tile_motion
+from hybrid_opt.robust.force import robust_model
 from symbolic.array import Array
 from symbolic.contact.registry import command_model
 from symbolic.contact.worst_cases import (

@@ -14,10 +14,14 @@ from symbolic.records import Uncertainty
 if TYPE_CHECKING:
     pass
 
-from hybrid_opt.robust.force import CASES, RobustModel, SampledCheck, allowed_factor, subsample
+from hybrid_opt.robust.force import RobustModel, SampledCheck, allowed_factor, subsample
 
 MOST, POINTS = 2.0, 9
 """Largest multiple of the uncertainty in a price of robustness, and number of multiples."""
+
+
+CASES = 100_000
+"""Number of random cases in which every priced carry is checked."""
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import maximum_filter1d
 
-from hybrid_opt.carry import Carry
-from hybrid_opt.robust.force import HeldMotion, RobustModel, at_standstill, box_motion, robust_model
+from hybrid_opt.carry import Carry, HeldMotion, at_standstill, box_motion
+from hybrid_opt.robust.force import RobustModel, robust_model
 from symbolic.array import Array
 from symbolic.contact.registry import command_model
 from symbolic.errors import SettingsError

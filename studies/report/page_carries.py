@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 import hybrid_opt as ho
 from hybrid_opt.campaign.stages import ReadyCell
+from hybrid_opt.carry import BoxMotion, box_motion
 from hybrid_opt.display.scene import packed
 from hybrid_opt.display.table import NOTHING, Table, number, torque_use
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
@@ -23,7 +24,7 @@ from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job, Phase
 from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.robust.cases import LEADER
-from hybrid_opt.robust.force import BoxMotion, box_motion, robust_model
+from hybrid_opt.robust.force import robust_model
 from hybrid_opt.robust.squeeze import SqueezeSettings, commanded_forces
 from hybrid_opt.timing.analysis import drivable_timing
 from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_opt.carry import ArmMotion, Carry
+from hybrid_opt.carry import ArmMotion, Carry, box_motion
 from hybrid_opt.errors import SimulationError
 from hybrid_opt.extras.simulation.box import bisected, carriage_motion
 from hybrid_opt.extras.simulation.hand_bodies import HandSprings
@@ -19,7 +19,7 @@ from hybrid_opt.extras.simulation.hands import (
     HAND_SETTINGS,
     HandSimulation,
 )
-from hybrid_opt.robust.force import box_motion, interpreted_robust_model
+from hybrid_opt.robust.force import interpreted_robust_model
 from studies.research.plain.motion import angular_rates
 from symbolic.array import Array
 from symbolic.read.cell import load

@@ -24,6 +24,7 @@ from codegen.function import NumericFunction
 from codegen.interpreted import InterpretedFunction
 from hybrid_opt import compiled_cell
 from hybrid_opt.campaign.stages import build_study
+from hybrid_opt.carry import at_rest
 from hybrid_opt.cell import Cell
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate import kernel
@@ -31,7 +32,7 @@ from hybrid_opt.job.plan import JobCollisions
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.progress import Progress
-from hybrid_opt.robust.force import RobustModel, at_rest, robust_model
+from hybrid_opt.robust.force import RobustModel, robust_model
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_timer import search_carry
 from symbolic.cell_model import CellModel

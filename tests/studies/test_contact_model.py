@@ -12,6 +12,7 @@ import pytest
 from codegen.cache import Cache
 from codegen.interpreted import InterpretedFunction
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
+from hybrid_opt.carry import BoxMotion, motion_inputs
 from hybrid_opt.polishing.settings import (
     DrivableSettings,
     FillSettings,
@@ -19,7 +20,7 @@ from hybrid_opt.polishing.settings import (
     ProbeSettings,
 )
 from hybrid_opt.progress import Progress
-from hybrid_opt.robust.force import BoxMotion, interpreted_robust_model, motion_inputs
+from hybrid_opt.robust.force import interpreted_robust_model
 from studies.programs.study import StudySettings, run_study
 from studies.report import PAGE
 from studies.study.recommendation import read_recommendation

@@ -10,6 +10,7 @@ import pytest
 from scipy.optimize import brentq
 
 import hybrid_opt as ho
+from hybrid_opt.carry import BoxMotion
 from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.recommending.advice import changes_of_cell
@@ -23,7 +24,7 @@ from hybrid_opt.recommending.recommendation import (
     table_forces,
 )
 from hybrid_opt.robust.cases import random_cases
-from hybrid_opt.robust.force import BoxMotion, RobustModel, robust_model, subsample
+from hybrid_opt.robust.force import RobustModel, robust_model, subsample
 from hybrid_opt.robust.squeeze import commanded_forces
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array

@@ -10,13 +10,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from hybrid_opt.carry import BoxMotion
 from hybrid_opt.robust.budget import (
     GripBudget,
     budget_text,
     cheapest_remedies,
     grip_budget,
 )
-from hybrid_opt.robust.force import BoxMotion, interpreted_robust_model
+from hybrid_opt.robust.force import interpreted_robust_model
 from symbolic.contact.registry import command_model
 from symbolic.read.cell import changed
 from symbolic.records import USUAL_UNCERTAINTY, Workcell

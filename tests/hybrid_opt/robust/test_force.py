@@ -10,6 +10,7 @@ import pytest
 
 from codegen.lanes import lane_text
 from codegen.source import dense, generated_c
+from hybrid_opt.carry import BoxMotion, at_rest
 from hybrid_opt.evaluate.objectives import OBJECTIVES
 from hybrid_opt.robust.cases import nominal_case, random_cases, worst_cases
 from hybrid_opt.robust.force import (
@@ -18,10 +19,8 @@ from hybrid_opt.robust.force import (
     LARGEST_FACTOR,
     SAMPLES,
     SCREENED,
-    BoxMotion,
     RobustModel,
     allowed_factor,
-    at_rest,
 )
 from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, RobustPath
 from symbolic.array import Array

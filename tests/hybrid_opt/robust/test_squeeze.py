@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybrid_opt.carry import Carry
-from hybrid_opt.robust.force import SAMPLES, BoxMotion, RobustModel, robust_model, subsample
+from hybrid_opt.carry import BoxMotion, Carry
+from hybrid_opt.robust.force import SAMPLES, RobustModel, robust_model, subsample
 from hybrid_opt.robust.price import robust_price
 from hybrid_opt.robust.squeeze import (
     UNCERTAINTY_SOURCES,

@@ -12,12 +12,13 @@ import casadi as ca
 import numpy as np
 import pytest
 
+from hybrid_opt.carry import BoxMotion
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator, LockedEvaluator
 from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
-from hybrid_opt.robust.force import BoxMotion, RobustModel
+from hybrid_opt.robust.force import RobustModel
 from hybrid_opt.robust.path_force import RobustPath
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import TimingLimits

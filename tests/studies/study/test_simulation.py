@@ -7,8 +7,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hybrid_opt.carry import box_motion
 from hybrid_opt.extras.simulation.hands import own_forces
-from hybrid_opt.robust.force import box_motion, interpreted_robust_model
+from hybrid_opt.robust.force import interpreted_robust_model
 from studies.research.hand_carries import carry_along
 from studies.study.simulation import _simulated_hands
 from symbolic.read.cell import load

@@ -15,7 +15,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from hybrid_opt.robust.force import BoxMotion, interpreted_robust_model
+from hybrid_opt.carry import BoxMotion
+from hybrid_opt.robust.force import interpreted_robust_model
 from symbolic.array import Array
 from symbolic.contact.elastic import kern, layer_shares
 from symbolic.contact.force_closure import wrench_to_box

@@ -10,13 +10,14 @@ import pytest
 
 pytest.importorskip("mujoco")
 
+from hybrid_opt.carry import box_motion
 from hybrid_opt.extras.simulation.box import bisected, carriage_motion
 from hybrid_opt.extras.simulation.hand_bodies import ArmStiffness, HandSprings, lip_points
 from hybrid_opt.extras.simulation.hands import (
     HAND_SETTINGS,
     HandSimulation,
 )
-from hybrid_opt.robust.force import box_motion, interpreted_robust_model
+from hybrid_opt.robust.force import interpreted_robust_model
 from studies.research.hand_carries import (
     KINDS,
     RESOLUTION,
