@@ -409,8 +409,9 @@ def bound_to(function: NumericFunction, numbers: WorkcellParameters) -> NumericF
     return function.bound({name: numbers.vector(name) for name in names})
 
 
-_held: dict[tuple[Path, str, int], NumericFunction] = {}
-"""Functions loaded by `contact_function`, which all cells of the same topology share."""
+_held: dict[tuple[str, str, int], NumericFunction] = {}
+"""Functions loaded by `contact_function`, which all cells of the same topology share, by name,
+digest of the topology, and lanes."""
 
 
 def contact_function(
@@ -434,15 +435,16 @@ def contact_function(
     Raises:
         DualArmError: the code of the function cannot be built.
     """
-    numbers, cache = _held_numbers(workcell), Cache()
-    key = key_of(
-        name,
-        structure=numbers.workcell_digest,
-        expressions=_expressions(cache.folder),
-        libraries=[f"scipy {library_version('scipy')}"],
-    )
-    of = (cache.folder, key, lanes)
+    numbers = _held_numbers(workcell)
+    of = (name, numbers.workcell_digest, lanes)
     if of not in _held:
+        cache = Cache()
+        key = key_of(
+            name,
+            structure=numbers.workcell_digest,
+            expressions=_expressions(cache.folder),
+            libraries=[f"scipy {library_version('scipy')}"],
+        )
         built = load_or_build(key, lambda: {name: make(numbers.symbols())}, cache, lanes=lanes)
         _held[of] = built[name]
     return bound_to(_held[of], numbers)
