@@ -45,7 +45,7 @@ from symbolic.records import (
     Uncertainty,
     Workcell,
 )
-from symbolic.records.cell import reading_of
+from symbolic.records.content import reading_of
 from symbolic.records.poses import box_placement, inverse
 from symbolic.records.problems import Problems, matching, suggestion
 

@@ -8,8 +8,8 @@ nothing that is cached under a digest belongs to another cell.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -19,7 +19,7 @@ import numpy as np
 from symbolic.array import Array, Range, Vector
 from symbolic.errors import SettingsError
 from symbolic.records import quantities as quantity
-from symbolic.records.content import digest_of_parts
+from symbolic.records.content import Reading, reading_of
 from symbolic.records.poses import inverse, read_only
 from symbolic.records.problems import Label, text_pattern
 from symbolic.records.shapes import Body, Box, Cylinder, Mesh
@@ -429,49 +429,6 @@ class Handling:
         other arm stops `PARTNER_TIME` later.
         """
         return np.inf if self.partner_stop is None else self.partner_stop / PARTNER_TIME
-
-
-# --- identity ---
-
-
-@dataclass(frozen=True)
-class Reading:
-    """Digests of a workcell at the time when it was read from its file.
-
-    Attributes:
-        files: SHA-256 over the workcell file and the content of every file it names.
-        values: SHA-256 over every value of the records; a path counts relative to the workcell
-            file.
-        named: paths in the records, and the arguments with which each robot's description is
-            expanded. They decide which files describe the cell.
-    """
-
-    files: str
-    values: str
-    named: frozenset[str]
-
-
-def reading_of(workcell: Any, files: str) -> Reading:
-    """Compute the digests that show later whether a workcell has changed since it was read.
-
-    Args:
-        workcell: the workcell.
-        files: digest of the workcell's files, which is copied to the result.
-    """
-    arms = [(r.urdf, r.package_dirs, r.xacro_arguments, r.srdf) for r in workcell.robots]
-    values = digest_of_parts(workcell, workcell.source.parent)
-    return Reading(files, values, frozenset([*_paths(workcell), *map(repr, arms)]))
-
-
-def _paths(value: Any) -> Iterator[str]:
-    if is_dataclass(value):
-        for field in fields(value):
-            yield from _paths(getattr(value, field.name))
-    elif isinstance(value, tuple):
-        for entry in value:
-            yield from _paths(entry)
-    elif isinstance(value, Path):
-        yield str(value)
 
 
 # --- the whole cell ---

@@ -1,11 +1,11 @@
-"""Records and their values as bytes, for digests and cache keys."""
+"""Records and their values as bytes, for digests and cache keys; the identity of a workcell."""
 
 from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Hashable
-from dataclasses import fields
+from collections.abc import Hashable, Iterator
+from dataclasses import dataclass, fields, is_dataclass
 from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import Any
@@ -141,3 +141,46 @@ class CacheKey:
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, CacheKey) and self._known == other._known
+
+
+# --- the digest of a workcell when it was read ---
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Digests of a workcell at the time when it was read from its file.
+
+    Attributes:
+        files: SHA-256 over the workcell file and the content of every file it names.
+        values: SHA-256 over every value of the records; a path counts relative to the workcell
+            file.
+        named: paths in the records, and the arguments with which each robot's description is
+            expanded. They decide which files describe the cell.
+    """
+
+    files: str
+    values: str
+    named: frozenset[str]
+
+
+def reading_of(workcell: Any, files: str) -> Reading:
+    """Compute the digests that show later whether a workcell has changed since it was read.
+
+    Args:
+        workcell: the workcell.
+        files: digest of the workcell's files, which is copied to the result.
+    """
+    arms = [(r.urdf, r.package_dirs, r.xacro_arguments, r.srdf) for r in workcell.robots]
+    values = digest_of_parts(workcell, workcell.source.parent)
+    return Reading(files, values, frozenset([*_paths(workcell), *map(repr, arms)]))
+
+
+def _paths(value: Any) -> Iterator[str]:
+    if is_dataclass(value):
+        for field in fields(value):
+            yield from _paths(getattr(value, field.name))
+    elif isinstance(value, tuple):
+        for entry in value:
+            yield from _paths(entry)
+    elif isinstance(value, Path):
+        yield str(value)
