@@ -22,7 +22,7 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 
 from codegen.build import compiler_of
-from codegen.cache import Cache
+from codegen.cache import Cache, source_digest
 from codegen.compiler import interruptible
 from codegen.errors import CodegenError
 from codegen.native import one_thread
@@ -441,7 +441,8 @@ def build_study(cell: Cell, progress: Progress, polish: bool = True, drivable: b
     """
     cache = cell.compiled.cache or Cache()
     what = (str(cell.force_kind), str(polish), str(drivable), compiler_of(cache).identity)
-    sources = cache.code_digest("codegen", "hybrid_opt")
+    # With comments: other ones cost a look at all sets, digests without them a parse of everything.
+    sources = source_digest("codegen", "hybrid_opt")
     key = cell.compiled.key("study", *what, version("casadi"), sources)
     if cache.read_record(key) is not None:
         return

@@ -7,6 +7,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from pathlib import Path
+from threading import Lock
 from typing import Literal
 
 import numpy as np
@@ -351,7 +352,8 @@ class MeshReader:
 
         key = (mesh.path, tuple(mesh.scale))
         if key not in self.known:
-            found = _cut_file(*key, _state(mesh.path))
+            with _CUTTING:
+                found = _cut_file(*key, _state(mesh.path))
             faces = found.faces + sum(known.faces for known in self.known.values())
             if faces > MOST_CELL_FACES:
                 raise CollisionModelError(
@@ -371,6 +373,10 @@ def _state(path: Path) -> tuple[int, int]:
     except OSError:
         return (0, 0)
     return (found.st_mtime_ns, found.st_size)
+
+
+_CUTTING = Lock()
+"""Threads that need the same mesh at once shall not all decompose it."""
 
 
 @lru_cache(maxsize=64)

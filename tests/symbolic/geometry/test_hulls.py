@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import Barrier
 
 import numpy as np
 import trimesh
@@ -13,6 +15,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from symbolic.array import Array
+from symbolic.geometry.bodies import MeshReader, _cut_file
 from symbolic.geometry.hulls import (
     ROUNDOFF,
     SMALL_PART,
@@ -24,6 +27,7 @@ from symbolic.geometry.hulls import (
 )
 from symbolic.geometry.pieces import Hull
 from symbolic.read.meshes import read_mesh
+from symbolic.records import Mesh
 
 
 def placed(points: Array, seed: int) -> Hull:
@@ -138,3 +142,26 @@ def test_the_pieces_of_a_mesh_are_simplified(tmp_path: Path) -> None:
     assert counts[0] == 8
     assert len(counts) == 2
     assert counts[1] < 0.2 * len(pin.vertices)
+
+
+def test_threads_decompose_a_mesh_once_and_again_when_its_file_changes(tmp_path: Path) -> None:
+    path, together = tmp_path / "part.stl", Barrier(4)
+    mesh = Mesh(path, np.ones(3))
+
+    def corners(_: int) -> Array:
+        together.wait()
+        (hull,) = MeshReader().hulls(mesh)
+        return hull.vertices
+
+    def found(radius: float) -> tuple[list[Array], int]:
+        trimesh.creation.icosphere(4, radius).export(path)
+        before = _cut_file.cache_info().misses
+        with ThreadPoolExecutor(4) as pool:
+            return list(pool.map(corners, range(4))), _cut_file.cache_info().misses - before
+
+    small, large = found(0.1), found(0.25)
+    assert (small[1], large[1]) == (1, 1)
+    for several, radius in ((small[0], 0.1), (large[0], 0.25)):
+        for each in several:
+            reach = np.linalg.norm(each, axis=1)
+            assert radius - 1e-6 <= reach.max() <= radius + 1e-3
