@@ -118,7 +118,7 @@ class CompiledCell:
 
             return branch_functions(model)
 
-        found = self.functions("branches", make, lanes=0, bodies=False)
+        found = self.functions("branches", make, lanes=0, bodies=False, taped=True)
         geometry = self.geometry
         asked = [self.screening[f"{block}clearance"] for block in geometry.asked]
 

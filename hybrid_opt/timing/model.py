@@ -323,7 +323,7 @@ class TimingModel:
         def make(model: CellModel) -> dict[str, ca.Function]:
             return timing_functions(model, samples)
 
-        self._functions = compiled.functions("timing", make, str(samples), bodies=False)
+        self._functions = compiled.functions("timing", make, str(samples), bodies=False, taped=True)
 
     def path_motion(self, x: Array) -> PathMotion:
         """Compute the geometry of a path at `REFINEMENT` samples per interval, uniform in u. The
