@@ -6,6 +6,10 @@ constraint, with the pairs, joints and robots that are in the way most, and the 
 pairs (--pairs lists them with the reasons for those left out); with --polish the bounds that a
 short polish ends on; draws the cell, both arms' reach and the first collision of trajectories that
 fail; with --view writes a page that shows the hand-made one at any sample.
+
+With --reach it finds only where both arms can hold the box at once, also for a problem file, which
+may lack start and goal: draws it from above at some heights, and prints the best place, or else the
+least change of bases or tools with which there is one.
 """
 
 from __future__ import annotations
@@ -13,12 +17,39 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from studies.options import add, whole
+from studies.options import add, number, whole
 from studies.program import Parser, Program
+from symbolic.errors import SettingsError
 
 
 def _add_options(parser: Parser) -> None:
-    add(parser, "WORKCELL")
+    add(parser, "WORKCELL", help="the workcell file; with --reach also a problem file")
+    reach = parser.add_argument_group("where both arms can hold the box")
+    reach.add_argument(
+        "--reach",
+        action="store_true",
+        help="only find and draw the places at which both arms can hold the box",
+    )
+    reach.add_argument(
+        "--heights",
+        type=number(-10.0, 10.0),
+        nargs="+",
+        metavar="Z",
+        help="heights of the centre of the box [m] (default: six that hold)",
+    )
+    reach.add_argument(
+        "--step",
+        type=number(0.01, 1.0),
+        metavar="M",
+        help="distance between places [m] (default: 0.02 to 0.2, at most 1000 places)",
+    )
+    reach.add_argument(
+        "--yaws",
+        type=whole(1, 36),
+        metavar="N",
+        help="directions of the box, evenly over half a turn, or over a whole one if the file "
+        "places the pads (default: 4)",
+    )
     parser.add_argument(
         "--candidates",
         type=whole(1, 10**7),
@@ -50,6 +81,11 @@ def _add_options(parser: Parser) -> None:
 
 def _complete(options: argparse.Namespace) -> None:
     options.output = options.output or Path("inspect") / options.workcell.stem
+    others = ("polish", "view", "pairs") if options.reach else ("heights", "step", "yaws")
+    for name in others:
+        if getattr(options, name):
+            told = "does not go with" if options.reach else "needs"
+            raise SettingsError(f"--{name} {told} --reach")
 
 
 main = Program(

@@ -392,7 +392,7 @@ def draw(
     from studies.report.drawing import DrawnCarry, in_style, save, settled
     from studies.report.pictures_cell import environment, meeting, reach_map, reachable_regions
 
-    _made(output)
+    make_folder(output)
     geometry, initial = cell.geometry, DrawnCarry("", carries["initial"])
     reach = reach_map(geometry, np.random.default_rng(0))
     with in_style():
@@ -425,13 +425,18 @@ def show(carry: Carry, why: Explanation | None, path: Path) -> str:
     """
     from hybrid_opt.display.scene import CarryView, Look
 
-    _made(path.parent)
+    make_folder(path.parent)
     look = None if why is None else Look(why.sample, str(why), why.pair or ())
     CarryView(carry, look=look).save(path)
     return str(path)
 
 
-def _made(folder: Path) -> None:
+def make_folder(folder: Path) -> None:
+    """Make the folder of `--output`.
+
+    Raises:
+        SettingsError: it cannot be made.
+    """
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -485,6 +490,11 @@ def inspect(options: argparse.Namespace) -> int:
     Raises:
         DualArmError: the workcell is invalid, or a picture cannot be written.
     """
+    if options.reach:
+        # Not imported at the top: it brings the proposals, which nothing else here needs.
+        from studies.programs.reach import inspect_reach
+
+        return inspect_reach(options)
     output = options.output
     findings = inspected(
         load_workcell(options.workcell),

@@ -24,7 +24,7 @@ from hybrid_opt.extras.proposing.kinematics import (
 from hybrid_opt.extras.proposing.trial import PoseJudge
 from symbolic.array import Array
 from symbolic.geometry.bodies import WORLD, Frame
-from symbolic.geometry.pairs import tools_in_payload
+from symbolic.geometry.pairs import CellGeometry, tools_in_payload
 from symbolic.geometry.separation import coal_distance
 from symbolic.read.arms import arm_model
 from symbolic.records import Contact
@@ -84,9 +84,7 @@ def clear_spins(query: HoldQuery, kinematics: ArmKinematics, spins: Array) -> Ar
 
     def clear(spin: float) -> bool:
         T_box_joint = kinematics.held(spin)
-        T_joint_box = [inverse(T_box_joint)] * 2
-        entering = tools_in_payload(geometry.bodies, T_joint_box)
-        if any(body.frame.robot == kinematics.arm for body in entering):
+        if enters_payload(geometry, kinematics, spin):
             return False
         return all(
             coal_distance(
@@ -99,6 +97,19 @@ def clear_spins(query: HoldQuery, kinematics: ArmKinematics, spins: Array) -> Ar
 
     found = np.array([spin for spin in spins if clear(spin)])
     return found if len(found) else spins
+
+
+def enters_payload(geometry: CellGeometry, kinematics: ArmKinematics, spin: float) -> bool:
+    """Return True if a tool of an arm enters the payload that the arm holds.
+
+    Args:
+        geometry: bodies of the cell.
+        kinematics: the arm.
+        spin: rotation of the pad about its normal, in addition to the one in the file [rad].
+    """
+    T_joint_box = [inverse(kinematics.held(spin))] * 2
+    entering = tools_in_payload(geometry.bodies, T_joint_box)
+    return any(body.frame.robot == kinematics.arm for body in entering)
 
 
 def initial_arc(start: Array, goal: Array, bow: Array) -> Array:

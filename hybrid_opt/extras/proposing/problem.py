@@ -41,6 +41,10 @@ PROPOSED = ("waypoints", "initial", "redundant")
 MOST_SIDES = 3
 """Places of hands with which bases are searched, the best."""
 
+DRAFT_HEIGHT, DRAFT_SPEED = 0.5, 0.25
+"""Provisional height of the box over the bases, and of its goal over its start [m]; provisional
+speed [m/s]."""
+
 DRAFT_ROOM = 0.01
 """Half-width of provisional bounds, without meaning [m, rad]."""
 
@@ -101,7 +105,7 @@ class Problem:
                 room for the hands.
         """
         entries = self.data["contacts"]
-        if all("xyz" in entry for entry in entries):
+        if self.states_contacts:
             keys = ("xyz", "spin", "further") if self.has_hands else ("xyz",)
             return [{key: entry[key] for key in keys if key in entry} for entry in entries]
         if self.has_hands:
@@ -123,6 +127,11 @@ class Problem:
         return (
             shoulder_positions(self._robots()) if self.is_machine else np.array(found, dtype=float)
         )
+
+    @property
+    def states_contacts(self) -> bool:
+        """True if the file states where both pads or hands are on the box."""
+        return all("xyz" in entry for entry in self.data["contacts"])
 
     @property
     def has_hands(self) -> bool:
@@ -175,7 +184,7 @@ class Problem:
             For each placement the two tables of contacts as they stand in a file; an empty list if
             the file states the places or has no bases.
         """
-        if self._bases is None or all("xyz" in entry for entry in self.data["contacts"]):
+        if self._bases is None or self.states_contacts:
             return []
         if self.has_hands:
             return self._hand_places[1:]
@@ -215,11 +224,11 @@ class Problem:
         """
         entries = self.data["contacts"]
         start, goal = self.poses
-        if self.has_hands and not all("xyz" in entry for entry in entries):
+        if self.has_hands and not self.states_contacts:
             placed = [merged(entries, place) for place in self._hand_places[:MOST_SIDES]]
             return [replace(self, data={**self.data, "contacts": each}) for each in placed]
         level = float(np.linalg.norm((goal - start)[:2]))
-        if all("xyz" in entry for entry in entries) or not (self.is_machine or level < LEAST_LEVEL):
+        if self.states_contacts or not (self.is_machine or level < LEAST_LEVEL):
             return [self]
         R = box_placement(self.orientation, start)[:3, :3]
         found = []
@@ -281,11 +290,13 @@ class Problem:
         return completed(self.text, self.data, merged(paths, changes))
 
 
-def read_problem(path: str | Path) -> Problem:
+def read_problem(path: str | Path, with_poses: bool = True) -> Problem:
     """Read a problem file.
 
     Args:
         path: path of the file.
+        with_poses: False if only bases and box count, as for a map of their reach: `start`, `goal`
+            and `reference_speed` may then be missing, and get provisional values without meaning.
 
     Raises:
         WorkcellError: the file is not TOML, or required keys are missing.
@@ -298,13 +309,42 @@ def read_problem(path: str | Path) -> Problem:
     except OutsideError as error:
         raise WorkcellError(str(path), (f"file: {error}",)) from error
     problems = Problems()
-    _require_known(TableReader(data, "", problems))
+    if not with_poses:
+        _add_poses(TableReader(data, "", problems), data)
+    if not problems.found:
+        _require_known(TableReader(data, "", problems))
     if problems.found:
         raise WorkcellError(str(path), problems.messages())
     text = completed(text, data, {"task": dict.fromkeys(PROPOSED)})
     for key in PROPOSED:
         data["task"].pop(key, None)
     return Problem(source, text, data)
+
+
+def _add_poses(table: TableReader, data: dict[str, Any]) -> None:
+    """Put provisional poses between the robots' bases into the task, where there are none, and drop
+    what only a carry needs. Report missing bases.
+
+    Args:
+        table: reader of the whole problem file.
+        data: tables of the file, which are changed.
+    """
+    bases = []
+    for robot in table.tables("robots", exactly=2):
+        if robot.raw("base", None) is None:
+            robot.add("base", "is missing, but needed; propose --bases chooses bases for a carry")
+        else:
+            bases.append(robot.table("base").vector("xyz", (quantity.POSITION,) * 3))
+    task = data.setdefault("task", {})
+    if table.problems.found or not isinstance(task, dict):
+        return
+    for key in (*PROPOSED, "time_law"):
+        task.pop(key, None)
+    x, y, z = np.mean(bases, axis=0).tolist()
+    task.setdefault("start", [x, y, z + DRAFT_HEIGHT, 0.0, 0.0, 0.0])
+    x, y, z, *angles = task["start"]
+    task.setdefault("goal", [x, y, z + DRAFT_HEIGHT, *angles])
+    task.setdefault("reference_speed", DRAFT_SPEED)
 
 
 def _require_known(table: TableReader) -> None:

@@ -4,7 +4,7 @@ moved or raised, longer tools, another height of the goal. The changes are found
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -36,10 +36,12 @@ class ProblemChange:
     Attributes:
         text: description of the change, with a placeholder for the amount in metres.
         change: function of a problem, a copy of its tables and an amount [m] that changes the copy.
+        moves_machine: True if robots or tools change, False if the task does.
     """
 
     text: str
     change: Callable[[Problem, Tables, float], None]
+    moves_machine: bool = True
 
     def applied(self, problem: Problem, amount: float) -> Problem:
         """Return a copy of a problem to which this change is applied.
@@ -109,33 +111,54 @@ PROBLEM_CHANGES = (
     ProblemChange("bases {:.2f} m farther away", _move_bases(-1.0)),
     ProblemChange("bases {:.2f} m higher", _raise_bases),
     ProblemChange("tools {:.2f} m longer", _lengthen_tools),
-    ProblemChange("goal {:.2f} m lower", _shift_goal(-1.0)),
-    ProblemChange("goal {:.2f} m higher", _shift_goal(1.0)),
+    ProblemChange("goal {:.2f} m lower", _shift_goal(-1.0), moves_machine=False),
+    ProblemChange("goal {:.2f} m higher", _shift_goal(1.0), moves_machine=False),
 )
 
 
 def least_changes(
-    problem: Problem, spins: Array, rng: np.random.Generator, is_over: Callable[[], bool]
+    problem: Problem,
+    can_hold: Callable[[Problem], bool],
+    is_over: Callable[[], bool],
+    kinds: Sequence[ProblemChange] = PROBLEM_CHANGES,
+    amounts: Sequence[float] = AMOUNTS,
 ) -> list[tuple[ProblemChange, float]]:
     """Find the smallest change of each kind with which both arms can hold the box.
 
     Args:
         problem: problem whose file states the bases and the pads' places.
-        spins: (n,) rotations of the pads about their normals that are tried [rad].
-        rng: generator of random postures.
+        can_hold: function that returns True for a problem in which both arms can hold the box.
         is_over: function that returns True if the search has to end.
+        kinds: kinds of changes that are tried.
+        amounts: amounts that are tried, the smallest first [m].
 
     Returns:
         Kinds of changes with their amounts [m], the smallest amount first.
     """
     found: dict[ProblemChange, float] = {}
-    for amount in AMOUNTS:
-        for kind in PROBLEM_CHANGES:
+    for amount in amounts:
+        for kind in kinds:
             if len(found) == ENOUGH_CHANGES or is_over():
                 return list(found.items())
-            if kind not in found and _can_hold(kind.applied(problem, amount), spins, rng):
+            if kind not in found and can_hold(kind.applied(problem, amount)):
                 found[kind] = amount
     return list(found.items())
+
+
+def changes_text(found: Sequence[tuple[ProblemChange, float]]) -> str:
+    """Return a text that lists changes as alternatives.
+
+    Args:
+        found: kinds of changes with their amounts [m].
+    """
+    return ", or ".join(kind.text.format(amount) for kind, amount in found)
+
+
+def states_machine(problem: Problem) -> bool:
+    """Return True if a problem's file states the bases and the pads of both robots, which changes
+    move."""
+    robots = problem.data["robots"]
+    return all("xyz" in robot.get("base", {}) and "xyz" in robot.get("pad", {}) for robot in robots)
 
 
 def _can_hold(problem: Problem, spins: Array, rng: np.random.Generator) -> bool:
@@ -159,13 +182,7 @@ def remedies_text(
         rng: generator of random postures.
         is_over: function that returns True if the search has to end.
     """
-    robots = problem.data["robots"]
-    if not all(
-        "xyz" in robot.get("base", {}) and "xyz" in robot.get("pad", {}) for robot in robots
-    ):
+    if not states_machine(problem):
         return ""
-    found = least_changes(problem, spins, rng, is_over)
-    if not found:
-        return ""
-    told = ", or ".join(kind.text.format(amount) for kind, amount in found)
-    return f"; both arms could hold it with {told}"
+    found = least_changes(problem, lambda changed: _can_hold(changed, spins, rng), is_over)
+    return f"; both arms could hold it with {changes_text(found)}" if found else ""

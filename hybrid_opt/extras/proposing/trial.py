@@ -28,7 +28,7 @@ from symbolic.cell_model import (
 )
 from symbolic.contact.registry import contact_model
 from symbolic.functions import motion_function
-from symbolic.geometry.bodies import MeshReader, shape_pieces
+from symbolic.geometry.bodies import WORLD, MeshReader, shape_pieces
 from symbolic.geometry.pairs import CellGeometry
 from symbolic.geometry.pieces import Piece, support
 from symbolic.geometry.separation import coal_distance
@@ -276,6 +276,23 @@ class PoseJudge:
         q_1, q_2 = (q, absent) if arm == 0 else (absent, q)
         bounds = self.checker.bounds(pose, q_1, q_2)
         bounds[:, self._others[arm]] = np.inf
+        return self.checker.check(pose, q_1, q_2, bounds).colliding
+
+    def payload_colliding(self, pose: Array) -> NDArray[np.bool_]:
+        """Find box poses at which the box collides with bodies that are fixed in the world. Moving
+        links are left out.
+
+        Args:
+            pose: (n, 6) box poses [m, rad].
+
+        Returns:
+            (n,) True for poses that collide.
+        """
+        bodies = self.geometry.bodies
+        frames = [{bodies[p.first].frame, bodies[p.second].frame} for p in self.geometry.active]
+        standing = [WORLD in both and any(f.kind == "box" for f in both) for both in frames]
+        q_1, q_2 = (np.zeros((len(pose), arm.joints)) for arm in self.geometry.arms)
+        bounds = np.where(standing, self.checker.bounds(pose, q_1, q_2), np.inf)
         return self.checker.check(pose, q_1, q_2, bounds).colliding
 
     def resting(self, pose: Array) -> list[tuple[str, bool]]:
