@@ -37,9 +37,13 @@ from hybrid_opt.extras.simulation.box import (
     workcell_of_case,
 )
 from hybrid_opt.extras.simulation.hand_bodies import HandSprings
+from hybrid_opt.extras.simulation.hand_cases import (
+    hand_case_threshold,
+    random_hand_cases,
+    worst_hand_case,
+)
 from hybrid_opt.extras.simulation.hands import (
     HAND_SETTINGS,
-    HandSimulation,
     hand_threshold,
     own_forces,
 )
@@ -59,6 +63,7 @@ from hybrid_opt.extras.simulation.scene import (
 )
 from hybrid_opt.progress import Progress
 from hybrid_opt.robust.cases import nominal_case, random_cases
+from hybrid_opt.robust.force import robust_model
 from hybrid_opt.robust.squeeze import SqueezeSettings, commanded_forces
 from hybrid_opt.store.files import AGAIN, storing
 from hybrid_opt.store.trajectory_file import read_trajectory
@@ -265,19 +270,21 @@ def simulate_hands(
         return
     forces, squeeze = commanded_forces(workcell, carry, SqueezeSettings(leader=options.leader - 1))
     holding, motion = own_forces(workcell, forces.max(axis=0)), carriage_motion(carry, settings)
-    rng = np.random.default_rng(options.seed)
-    cases = random_cases(workcell, workcell.uncertainty, options.runs, rng)
-    held = np.zeros(2, dtype=int)
-    for case in cases:
-        direction = rng.normal(size=3)
-        opposed = case[17] * direction / np.linalg.norm(direction)
-        drawn = HandSimulation(workcell_of_case(workcell, case), settings, case[8:11], opposed)
-        left = 1.0 - case[15:17].max()
-        held += [drawn.simulate(motion, holding, share * left).holds for share in (1.0, 0.5)]
-    print(
-        f"  hold with {holding[0]:.2f} / {holding[1]:.2f} N, {squeeze}: {held[0]} of {len(cases)} "
-        f"random cases hold (seed {options.seed}), {held[1]} with half of it"
+    cases = random_hand_cases(workcell, options.runs, np.random.default_rng(options.seed))
+    full, half = (
+        sum(case.simulate(motion, holding, share, settings).holds for case in cases)
+        for share in (1.0, 0.5)
     )
+    print(
+        f"  hold with {holding[0]:.2f} / {holding[1]:.2f} N, {squeeze}: {full} of {len(cases)} "
+        f"random cases hold (seed {options.seed}), {half} with half of it"
+    )
+    worst = worst_hand_case(carry, robust_model(workcell))
+    try:
+        least = hand_case_threshold(worst, motion, holding, settings)
+        print(f"  the model's worst case holds from {least.holds.factor:.3f} times this force on")
+    except SimulationError as error:
+        print(f"  in the model's worst case {error}")
 
 
 def _swept(step: float) -> tuple[float, float]:

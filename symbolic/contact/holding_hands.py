@@ -133,13 +133,38 @@ def _length(*components: Expression) -> Expression:
     return ca.sqrt(sum(component**2 for component in components) + FLOOR**2)
 
 
+def internal_force_wrenches(pads: Sequence[Contact], robots: Sequence[int]) -> Array:
+    """Compute the wrench on the payload of each hand if the hands of its arm push the payload
+    against the other arm.
+
+    The push results from an error of the arms' relative position; the elastic layers of the two
+    arms are springs in series.
+
+    Args:
+        pads: the n hands of both arms.
+        robots: index of the arm of each hand.
+
+    Returns:
+        (n, 6, 3) matrices from the push of the arm's hands, box frame [N], to the hand's wrench
+        about its origin along its axes [N, N m].
+    """
+    maps, stiff = [wrench_to_box(pad) for pad in pads], [layer_stiffness(pad) for pad in pads]
+    wholes = [np.zeros((6, 6)), np.zeros((6, 6))]
+    for A, K, i in zip(maps, stiff, robots, strict=True):
+        wholes[i] += A @ K @ A.T
+    softness = [np.linalg.inv(whole) for whole in wholes]
+    series = np.linalg.inv(softness[0] + softness[1])[:, :3]
+    wrench = series @ np.linalg.inv(series[:3])
+    each = zip(maps, stiff, robots, strict=True)
+    return np.array([K @ A.T @ softness[i] @ wrench for A, K, i in each])
+
+
 def internal_force_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Array:
     """Compute how much more holding force each hand needs if the arms push against each other, per
     newton of the push.
 
-    The push results from an error of the arms' relative pose; the elastic layers of the two arms
-    are springs in series. Consider a push of 1 N along the unit vector f. At a hand it adds the
-    normal force n . f. It also adds g(f): the tilting moment over the kern, or the sliding load
+    Consider a push of 1 N along the unit vector f (`internal_force_wrenches`). At a hand it adds
+    the normal force n . f. It also adds g(f): the tilting moment over the kern, or the sliding load
     over the friction coefficient, as in the conditions (1) and (2) of the module. The hand then
     needs g(f) - n . f more. The square of this is at most max(g)^2 + 2 g(n) + n . n for any
     direction f.
@@ -153,16 +178,9 @@ def internal_force_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Arra
         holding force is sqrt(a / mu^2 + b / mu + c), with the friction coefficient mu; against
         lifting off it is d.
     """
-    maps, stiff = [wrench_to_box(pad) for pad in pads], [layer_stiffness(pad) for pad in pads]
-    wholes = [np.zeros((6, 6)), np.zeros((6, 6))]
-    for A, K, i in zip(maps, stiff, robots, strict=True):
-        wholes[i] += A @ K @ A.T
-    softness = [np.linalg.inv(whole) for whole in wholes]
-    series = np.linalg.inv(softness[0] + softness[1])[:, :3]
-    wrench = series @ np.linalg.inv(series[:3])
     found = []
-    for pad, A, K, i in zip(pads, maps, stiff, robots, strict=True):
-        own, patch = K @ A.T @ softness[i] @ wrench, HandPatch.of(pad)
+    for pad, own in zip(pads, internal_force_wrenches(pads, robots), strict=True):
+        patch = HandPatch.of(pad)
         along, n, torsion = own[:2], own[2], own[5] / float(patch.twist)
         tilting = own[3:5] / np.array(patch.kern[::-1], dtype=float)[:, None]
         t, s = np.linalg.norm(along @ n), abs(torsion @ n)

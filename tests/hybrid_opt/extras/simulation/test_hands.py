@@ -13,6 +13,7 @@ pytest.importorskip("mujoco")
 from hybrid_opt.carry import box_motion
 from hybrid_opt.extras.simulation.box import bisected, carriage_motion
 from hybrid_opt.extras.simulation.hand_bodies import ArmStiffness, HandSprings, lip_points
+from hybrid_opt.extras.simulation.hand_cases import worst_hand_case
 from hybrid_opt.extras.simulation.hands import (
     HAND_SETTINGS,
     HandSimulation,
@@ -122,6 +123,25 @@ def springs(kind: HandKind, where: str, arms: ArmStiffness | None) -> tuple[Arra
         along = 1.0 / (1.0 / along + 1.0 / arms.linear)
         about = 1.0 / (1.0 / about + 1.0 / arms.angular)
     return along, about
+
+
+def test_the_worst_case_of_the_model_is_as_hard_as_it_says() -> None:
+    """The arms pull apart across the faces of two level cups, each of which also bears half of the
+    couple: what the model commands is what this takes."""
+    doubt, pull = Uncertainty(mass=0.1, tracking=0.2, internal_force=8.0), 8.0
+    workcell = replace(two_hands(ABOVE), uncertainty=doubt)
+    carry = carry_along(workcell, np.zeros(6), 0.3)
+    model = interpreted_robust_model(workcell)
+    force = float(model.commanded(box_motion(carry), doubt, 0).max())
+    moment = pull * float(np.ptp([c.T_box_pad[1, 3] for c in workcell.contacts])) / 2.0
+    needed = (1.1 * MASS * G / 2.0 + pull + moment / (RADIUS / 2.0)) / 0.8
+    assert force == pytest.approx(needed, rel=1e-3)
+    case = worst_hand_case(carry, model)
+    np.testing.assert_allclose(np.abs(case.opposed), [0.0, 0.0, pull], atol=0.05 * pull)
+    motion = carriage_motion(carry, HAND_SETTINGS)
+    simulate = partial(case.simulate, motion, np.full(2, force), settings=HAND_SETTINGS)
+    assert simulate(0.98).lifts
+    assert simulate(1.02).holds
 
 
 @pytest.mark.parametrize("arms", [None, SOFT])
