@@ -294,7 +294,7 @@ def test_thresholds_of_forty_carries_are_on_the_safe_side() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [6, 7, 15, 19, 21, 27, 33, 39])
+@pytest.mark.parametrize("seed", [6, 7, 15, 19, 21, 27, 33, 38, 39])
 def test_a_disturbance_covers_what_slow_swings_need(seed: int) -> None:
     """The model is quasi-static; these payloads swing fewer than 15 times in a carry."""
     carry = draw(KINDS[seed % len(KINDS)], np.random.default_rng([1, seed]), 4.0)
