@@ -29,7 +29,7 @@ from symbolic.contact.holding_hands import (
 from symbolic.contact.worst_cases import case_origin_load_function
 from symbolic.records import Workcell
 
-DIRECTIONS = 1000
+PUSH_DIRECTIONS = 1000
 """Number of directions in which the arms are tried to push against each other."""
 
 LOW_SHARE, HIGH_SHARE = 0.25, 1.25
@@ -127,7 +127,7 @@ def worst_hand_case(carry: Carry, model: RobustModel) -> HandCase:
     case = cases[which]
     states = (values[at] for values in motion_inputs(motion))
     load = np.array(case_origin_load_function(workcell)(*states, case)).ravel()
-    directions = _directions(DIRECTIONS)
+    directions = _directions(PUSH_DIRECTIONS)
     share = _needed_share(workcell, case, load, directions)
     return HandCase.of(workcell, case, directions[share.argmax()], np.zeros(3))
 
