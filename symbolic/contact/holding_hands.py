@@ -33,7 +33,7 @@ from symbolic.array import Array
 from symbolic.contact.elastic import kern, layer_shares, layer_stiffness
 from symbolic.contact.force_closure import wrench_to_box
 from symbolic.contact.model import (
-    FORCE_FLOOR,
+    HELD_FLOOR,
     ContactLoad,
     ContactModel,
     HeldLoad,
@@ -450,7 +450,7 @@ class HoldingHands(ContactModel):
         Returns:
             Ratios (n, 2) of a force to its limit, by name of the limit.
         """
-        held = np.maximum(self.held_with(commanded), FORCE_FLOOR)
+        held = np.maximum(self.held_with(commanded), HELD_FLOOR)
         return {"holding force": commanded / held} | super().force_use(commanded, least)
 
     def raised(self, planned: Array, extra: Array, leader: int) -> Array:

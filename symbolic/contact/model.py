@@ -29,7 +29,7 @@ Problem = tuple[str, str]
 Both = tuple[Expression, Expression]
 """One value per contact."""
 
-FORCE_FLOOR = 1e-9
+HELD_FLOOR = 1e-9
 """Least force of a ratio's denominator [N]."""
 
 
@@ -214,7 +214,7 @@ class ContactModel(ABC):
         """
         difference = np.abs(normal[:, :, 0] - normal[:, :, 1])
         squeeze = 2.0 * float(self.workcell.task.reference_force.min()) - difference
-        needed = tangential.sum(axis=2) / np.maximum(squeeze, FORCE_FLOOR)
+        needed = tangential.sum(axis=2) / np.maximum(squeeze, HELD_FLOOR)
         use: Array = needed.max(axis=1)
         return use / min(contact.friction for contact in self.workcell.contacts)
 
@@ -434,7 +434,7 @@ class ContactModel(ABC):
         Returns:
             Ratios (n, 2) of a force to its limit, by name of the limit.
         """
-        return {"least normal force": least / np.maximum(self.held_with(commanded), FORCE_FLOOR)}
+        return {"least normal force": least / np.maximum(self.held_with(commanded), HELD_FLOOR)}
 
     def pulled_apart(self, along: Array, across: Array, stiffness: float) -> tuple[Array, Array]:
         """Compute how the forces change if the arms, as springs in series, are displaced against

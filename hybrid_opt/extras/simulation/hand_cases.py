@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import casadi as ca
 import numpy as np
 
-from hybrid_opt.carry import Carry
+from hybrid_opt.carry import Carry, motion_inputs
 from hybrid_opt.extras.simulation.box import (
     CarriageMotion,
     Threshold,
@@ -18,7 +18,7 @@ from hybrid_opt.extras.simulation.hand_bodies import ArmStiffness
 from hybrid_opt.extras.simulation.hands import HandOutcome, HandSimulation
 from hybrid_opt.extras.simulation.scene import SimulationSettings
 from hybrid_opt.robust.cases import LEADER, random_cases
-from hybrid_opt.robust.force import RobustModel, motion_inputs, subsample
+from hybrid_opt.robust.force import RobustModel, subsample
 from symbolic.array import Array
 from symbolic.contact.elastic import layer_shares
 from symbolic.contact.holding_hands import (
