@@ -32,7 +32,7 @@ def _add_options(parser: Parser) -> None:
     )
     reach.add_argument(
         "--heights",
-        type=number(-10.0, 10.0),
+        type=float,
         nargs="+",
         metavar="Z",
         help="heights of the centre of the box [m] (default: six that hold)",

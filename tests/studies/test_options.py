@@ -76,6 +76,7 @@ CHECKED = {
         {"--evaluations", "--replicas", "--seed", "--jobs", "--polish-attempts"}
         | {"--drivable-replicas"},
     ),
+    "inspect": {"--heights"},
     "export": {"--squeeze", "--smoothing", "--step", "--stiffness", "--skew"},
     "replay": {"--force-curve"},
     "research.algorithms": {"--seeds", "--evaluations", "--population"},

@@ -73,8 +73,9 @@ class HoldMapSettings:
             raise SettingsError(f"step: found {self.step:g}; allowed is 0.01 to 1 m")
         if not 1 <= self.yaws <= 36:
             raise SettingsError(f"yaws: found {self.yaws}; allowed is 1 to 36")
-        if any(not abs(z) <= 10.0 for z in self.heights):
-            raise SettingsError("heights: allowed are -10 to 10 m")
+        for height in self.heights:
+            if not abs(height) <= 10.0:
+                raise SettingsError(f"heights: found {height:g}; allowed is -10 to 10 m")
 
 
 @dataclass(frozen=True, eq=False)
