@@ -171,11 +171,9 @@ def test_a_displaced_arm_loads_layers_and_arms_as_springs_in_series(
     ("kind", "where", "arms"),
     [
         ("cup", ABOVE, None),
-        ("cup", BESIDE, SOFT),
-        ("magnet", ABOVE, SOFT),
-        ("magnet", BESIDE, None),
-        ("fingers", ABOVE, None),
-        ("fingers", BESIDE, SOFT),
+        ("magnet", BESIDE, SOFT),
+        ("fingers", ABOVE, SOFT),
+        ("fingers", BESIDE, None),
     ],
 )
 def test_a_turned_arm_loads_layers_and_arms_as_springs_in_series(
