@@ -32,10 +32,8 @@ def _add_options(parser: Parser) -> None:
     )
     reach.add_argument(
         "--heights",
-        type=float,
-        nargs="+",
-        metavar="Z",
-        help="heights of the centre of the box [m] (default: six that hold)",
+        metavar="Z,Z",
+        help="heights of the centre of the box [m], such as 0.3,0.5 (default: six that hold)",
     )
     reach.add_argument(
         "--step",
@@ -79,7 +77,21 @@ def _add_options(parser: Parser) -> None:
     add(parser, "--json")
 
 
+def _heights(text: str | None) -> tuple[float, ...]:
+    """Parse heights [m] from 'Z,Z'; none if there is no text.
+
+    Raises:
+        SettingsError: the text is no list of numbers.
+    """
+    try:
+        return tuple(float(part) for part in (text or "").split(",") if text)
+    except ValueError as error:
+        told = f"--heights: found {text!a}; allowed are numbers with commas between [m]"
+        raise SettingsError(told) from error
+
+
 def _complete(options: argparse.Namespace) -> None:
+    options.heights = _heights(options.heights)
     options.output = options.output or Path("inspect") / options.workcell.stem
     others = ("polish", "view", "pairs") if options.reach else ("heights", "step", "yaws")
     for name in others:

@@ -211,8 +211,8 @@ def inspect_reach(options: argparse.Namespace) -> int:
     Raises:
         DualArmError: the file is wrong, or the picture cannot be written.
     """
-    heights = tuple(options.heights or ())
-    settings = HoldMapSettings(options.step, heights, options.yaws or HoldMapSettings.yaws)
+    yaws = options.yaws or HoldMapSettings.yaws
+    settings = HoldMapSettings(options.step, options.heights, yaws)
     findings = reached(
         read_problem(options.workcell, with_poses=False),
         settings,

@@ -76,7 +76,6 @@ CHECKED = {
         {"--evaluations", "--replicas", "--seed", "--jobs", "--polish-attempts"}
         | {"--drivable-replicas"},
     ),
-    "inspect": {"--heights"},
     "export": {"--squeeze", "--smoothing", "--step", "--stiffness", "--skew"},
     "replay": {"--force-curve"},
     "research.algorithms": {"--seeds", "--evaluations", "--population"},

@@ -20,7 +20,7 @@ def test_reach_is_told_and_drawn_without_poses(
 ) -> None:
     cell = tmp_path / "box.toml"
     cell.write_text(box_text(), encoding="utf-8")
-    grid = ["--step", "0.1", "--heights", "0.3", "2.5", "--yaws", "1"]
+    grid = ["--step", "0.1", "--heights", "0.3,2.5", "--yaws", "1"]
     assert inspect.main(["--reach", str(cell), *grid, "--json", "--output", str(tmp_path)]) == 0
     found = json.loads(capsys.readouterr().out)
     low, high = found["heights"]
@@ -39,5 +39,8 @@ def test_options_of_one_kind_of_inspection_go_together(tmp_path: Path) -> None:
     cell.write_text(box_text(), encoding="utf-8")
     with ended_by("settings", "--polish", "--reach"):
         inspect.main([str(cell), "--reach", "--polish"])
+    for wrong in ("high", "0.3,,1", "99"):
+        with ended_by("settings", "heights"):
+            inspect.main([str(cell), "--reach", "--heights", wrong])
     with ended_by("settings", "--yaws", "--reach"):
         inspect.main([str(cell), "--yaws", "2"])
