@@ -316,7 +316,7 @@ class TimingModel:
         self.passes = ForwardBackwardPasses(compiled, intervals)
         self.joint_names = self.passes.joint_names
         self.carry_limits = CarryLimits(self.workcell)
-        self._sample_limits = sample_limits_set(compiled, lanes=1)
+        self._sample_limits = sample_limits_set(compiled, lanes=0)
         samples = REFINEMENT * intervals + 1
         self._latest: PathMotion | None = None
 
