@@ -22,6 +22,7 @@ from hybrid_opt.extras.proposing.kinematics import (
     ArmKinematics,
     compiled_newton,
 )
+from hybrid_opt.extras.proposing.static_load import MOST_TORQUE, StaticLoad
 from hybrid_opt.extras.proposing.trial import PoseJudge
 from symbolic.array import Array
 from symbolic.records import POSE_SIZE, Workcell
@@ -43,6 +44,9 @@ CHAIN_RESIDUAL = 1e-6
 """Largest pose residual of a closed chain [m, rad]."""
 
 CHAIN_NEWTON_STEPS = 8
+
+SAME_LOAD = 1.05
+"""Along a path, holding the box may take so many times the torque of its ends."""
 
 MATCH = 1e-3
 """Largest difference of joints where two trees meet [rad]: both arms are then on the same
@@ -67,7 +71,8 @@ class _Follower:
     """An arm that follows the box with a fixed rotation of its pad."""
 
     def __init__(self, many: ArmKinematics, hold: Hold, model: pin.Model) -> None:
-        robot = many.workcell.robots[many.arm]
+        robot, waypoints = many.workcell.robots[many.arm], many.workcell.task.waypoints
+        start, goal = waypoints[0].lower, waypoints[-1].lower
         self.name, self.many = robot.name, many
         self.names = list(model.names)[1:]
         self.redundant = many.workcell.task.redundant_places[many.arm]
@@ -75,6 +80,11 @@ class _Follower:
         key = f"robots[{many.arm}].min_manipulability = {robot.min_manipulability:g} m^3"
         self.singular = f"{robot.name} is near a singular posture ({key})"
         self.side = many.side(hold.q_start)
+        self.load = StaticLoad(many.workcell, many.arm, model)
+        self.heavy = f"holding the box still takes too much torque of {robot.name}"
+        ends = zip((start, goal), (hold.q_start, hold.q_goal), strict=True)
+        taken = [self.load.share(pose[None], q[None], self.T_box_joint)[0] for pose, q in ends]
+        self.most_torque = max(MOST_TORQUE, *(SAME_LOAD * share for share in taken))
         self.lower, self.upper = many.lower + LIMIT_MARGIN, many.upper - LIMIT_MARGIN
 
     def follow(self, T_world_box: Array, extended: Array, q: Array) -> tuple[Array, str]:
@@ -308,8 +318,27 @@ class ClosedChain:
             return 0
         pose = np.array([place.extended[:POSE_SIZE] for place in places])
         q_1, q_2 = (np.array([place.q[arm] for place in places]) for arm in (0, 1))
-        hit = self.judge.colliding(pose, q_1, q_2)
+        hit = self.blocked(pose, (q_1, q_2))
         return int(np.argmax(hit)) if hit.any() else len(places)
+
+    def blocked(self, pose: Array, q: tuple[Array, Array]) -> NDArray[np.bool_]:
+        """Find configurations that collide, or in which holding the box at rest takes too much of a
+        joint's torque.
+
+        Args:
+            pose: (n, 6) box poses [m, rad].
+            q: joint positions (n, joints) of each arm [rad or m].
+
+        Returns:
+            (n,) True for these configurations.
+        """
+        hit = self.judge.colliding(pose, *q)
+        for arm, own in zip(self._arms, q, strict=True):
+            heavy = arm.load.share(pose, own, arm.T_box_joint) > arm.most_torque
+            if heavy.any():
+                self.refused[arm.heavy] += 1
+            hit |= heavy
+        return hit
 
 
 def metric_weights(size: int) -> Array:

@@ -36,7 +36,9 @@ from hybrid_opt.extras.proposing.kinematics import (
     ArmKinematics,
     pose_error,
 )
+from hybrid_opt.extras.proposing.static_load import MOST_TORQUE, StaticLoad
 from symbolic.array import Array
+from symbolic.read.arms import arm_model
 from symbolic.records.poses import box_placement
 
 MACHINE_STARTS = 512
@@ -51,8 +53,8 @@ MACHINE_STEPS = 60
 ENOUGH_TOGETHER = 12
 """Number of pairs of holds after which no further set is tried."""
 
-WELL_WITHIN = 1e-4
-"""Further distance from joint limits that Newton steps keep, beyond `LIMIT_MARGIN` [rad or m]."""
+WELL_WITHIN = 0.06
+"""Distance from joint limits that Newton steps keep, as a share of the range."""
 
 
 class MachineKinematics:
@@ -74,9 +76,9 @@ class MachineKinematics:
         spans = [arm.span for arm in arms]
         shared = [span[:, arm.common] for span, arm in zip(spans, arms, strict=True)]
         own = [span[:, joints] for span, joints in zip(spans, self._own, strict=True)]
-        margin = LIMIT_MARGIN + WELL_WITHIN
         self.lower = np.concatenate([np.maximum(shared[0][0], shared[1][0]), own[0][0], own[1][0]])
         self.upper = np.concatenate([np.minimum(shared[0][1], shared[1][1]), own[0][1], own[1][1]])
+        margin = np.maximum(WELL_WITHIN * (self.upper - self.lower), 1.01 * LIMIT_MARGIN)
         self.lower, self.upper = self.lower + margin, self.upper - margin
         self.rest = (self.lower + self.upper) / 2.0
         still = slice(0, self.common)
@@ -193,6 +195,9 @@ class _MachineSearch:
         arms = machine.arms
         workcell = arms[0].workcell
         self._orientation = workcell.task.orientation
+        self._loads = [
+            StaticLoad(workcell, arm.arm, arm_model(workcell.robots[arm.arm])) for arm in arms
+        ]
         possible = (possible_spins(workcell.contacts[arm.arm], query.spins) for arm in arms)
         self._spins = [clear_spins(query, *both) for both in zip(arms, possible, strict=True)]
         self._held = [
@@ -211,7 +216,7 @@ class _MachineSearch:
         fine = (residual <= REACHED) & self._regular(np.abs(determinant))
         x, which = x[fine], [part[fine] for part in which]
         self.found.within += len(x)
-        free = ~self._colliding(query.start, x)
+        free = ~self._blocked(query.start, x, which)
         x, which = x[free], [part[free] for part in which]
         self.found.free += len(x)
         for bow in GUIDES[: query.guides]:
@@ -242,7 +247,7 @@ class _MachineSearch:
             self.found.kept = float(kept.max()) / len(guide)
             self.found.stopped = "both arms together do not reach farther in one motion"
         rows = np.flatnonzero(alive)
-        free = ~self._colliding(self.query.goal, path[-1, rows])
+        free = ~self._blocked(self.query.goal, path[-1, rows], [part[rows] for part in which])
         for row in rows[free].tolist():
             ends = np.concatenate([path[0, row], path[-1, row]])
             if np.abs(self._known - ends).max(axis=1).min(initial=np.inf) > SAME_REDUNDANT:
@@ -274,16 +279,20 @@ class _MachineSearch:
         least = np.array([[arm.least] for arm in self.machine.arms])
         return np.asarray(np.all(measure >= least, axis=0))
 
-    def _colliding(self, pose: Array, x: Array) -> NDArray[np.bool_]:
-        """Return (n,) True for postures that collide while they hold the box at a pose (6,), and
-        count these collisions by pair of bodies."""
-        judge = self.query.judge
+    def _blocked(
+        self, pose: Array, x: Array, which: Sequence[NDArray[np.intp]]
+    ) -> NDArray[np.bool_]:
+        """Return (n,) True for postures in which the machine collides while it holds the box at a
+        pose (6,), or that take too much torque; count collisions by pair of bodies."""
+        judge, poses = self.query.judge, np.tile(pose, (len(x), 1))
         if judge is None or not len(x):
             return np.zeros(len(x), dtype=bool)
-        q_1, q_2 = (self.machine.joints(x, arm) for arm in (0, 1))
-        hit = judge.colliding(np.tile(pose, (len(x), 1)), q_1, q_2)
+        q = [self.machine.joints(x, arm) for arm in (0, 1)]
+        hit = judge.colliding(poses, *q)
         for row in np.flatnonzero(hit)[:MOST_HOLDS].tolist():
-            pair = judge.first_pair(pose, q_1[row], q_2[row])
+            pair = judge.first_pair(pose, q[0][row], q[1][row])
             if pair is not None:
                 self.found.pairs[pair] += 1
+        for load, own, held, part in zip(self._loads, q, self._held, which, strict=True):
+            hit |= load.share(poses, own, held[part]) > MOST_TORQUE
         return hit

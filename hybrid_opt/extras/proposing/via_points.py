@@ -238,7 +238,7 @@ def _lengths(chain: ClosedChain, paths: Array, near: tuple[Array, Array]) -> tup
     steps = np.diff(np.hstack(q).reshape(k, n, -1), axis=1)
     closed &= np.abs(np.hstack(q) - np.hstack(begin)).max(axis=1) <= JUMP
     hit = np.zeros(k * n, dtype=bool)
-    hit[closed] = chain.judge.colliding(flat[closed, :POSE_SIZE], q[0][closed], q[1][closed])
+    hit[closed] = chain.blocked(flat[closed, :POSE_SIZE], (q[0][closed], q[1][closed]))
     lost, met = ((~closed).reshape(k, n).mean(axis=1), hit.reshape(k, n).mean(axis=1))
     return np.linalg.norm(steps, axis=2).sum(axis=1), BLOCKED * (lost + met / 2.0)
 
