@@ -44,17 +44,15 @@ from symbolic.records.poses import box_placement
 MACHINE_STARTS = 512
 """Number of random postures of a machine from which Newton's method reaches for the box at once."""
 
-MACHINE_ROUNDS = 6
-"""Largest number of such sets of postures."""
+ROOM = (0.06, 0.06, 0.03, 0.0, 0.0, 0.0)
+"""Distance from joint limits that Newton steps keep, as a share of the range, for each such set of
+postures. With room the motions before and after the carry are possible more often."""
 
 MACHINE_STEPS = 60
 """Number of Newton steps from these postures."""
 
 ENOUGH_TOGETHER = 12
 """Number of pairs of holds after which no further set is tried."""
-
-WELL_WITHIN = 0.06
-"""Distance from joint limits that Newton steps keep, as a share of the range."""
 
 
 class MachineKinematics:
@@ -68,7 +66,13 @@ class MachineKinematics:
             their ranges, as far as limits allow [rad or m].
     """
 
-    def __init__(self, arms: Sequence[ArmKinematics]) -> None:
+    def __init__(self, arms: Sequence[ArmKinematics], room: float = 0.0) -> None:
+        """Prepare the kinematics.
+
+        Args:
+            arms: both arms.
+            room: distance from joint limits that postures keep, as a share of the range.
+        """
         self.arms, self.common = arms, len(arms[0].common)
         self._own = [np.delete(np.arange(arm.geometry.joints), arm.common) for arm in arms]
         middle = self.common + len(self._own[0])
@@ -78,7 +82,7 @@ class MachineKinematics:
         own = [span[:, joints] for span, joints in zip(spans, self._own, strict=True)]
         self.lower = np.concatenate([np.maximum(shared[0][0], shared[1][0]), own[0][0], own[1][0]])
         self.upper = np.concatenate([np.minimum(shared[0][1], shared[1][1]), own[0][1], own[1][1]])
-        margin = np.maximum(WELL_WITHIN * (self.upper - self.lower), 1.01 * LIMIT_MARGIN)
+        margin = np.maximum(room * (self.upper - self.lower), 1.01 * LIMIT_MARGIN)
         self.lower, self.upper = self.lower + margin, self.upper - margin
         self.rest = (self.lower + self.upper) / 2.0
         still = slice(0, self.common)
@@ -154,7 +158,7 @@ class MachineKinematics:
 
 
 def machine_holds(
-    query: HoldQuery, machine: MachineKinematics, rng: np.random.Generator
+    query: HoldQuery, arms: Sequence[ArmKinematics], rng: np.random.Generator
 ) -> tuple[HoldSearch, list[tuple[Hold, Hold]]]:
     """Find pairs of holds of a machine's arms whose common joints stand where they suit both arms,
     at the start and at the goal.
@@ -164,14 +168,15 @@ def machine_holds(
 
     Args:
         query: box poses at start and goal, and rotations of the pads to try.
-        machine: both arms on common joints.
+        arms: both arms, on common joints.
         rng: generator of random postures.
 
     Returns:
         Counts that explain a failure; and the pairs of holds.
     """
-    search = _MachineSearch(query, machine, rng)
-    for _ in range(MACHINE_ROUNDS):
+    search = _MachineSearch(query, MachineKinematics(arms), rng)
+    for room in ROOM:
+        search.machine = MachineKinematics(arms, room)
         search.round()
         if len(search.pairs) >= ENOUGH_TOGETHER:
             break
@@ -182,6 +187,7 @@ class _MachineSearch:
     """The search for pairs of holds of a machine's arms.
 
     Attributes:
+        machine: both arms, with the room that postures keep from joint limits.
         found: counts of the search so far.
         pairs: pairs of holds so far.
     """

@@ -235,7 +235,7 @@ def prepare(
     held = product(tried[0][0].holds, tried[0][1].holds)
     pairs = ranked_pairs(workcell, judge, held, (start, goal))
     if machine is not None and len(pairs) < ENOUGH_PAIRS:
-        found, moving = machine_holds(query, machine, rng)
+        found, moving = machine_holds(query, arms, rng)
         tried.append([found])
         pairs += ranked_pairs(workcell, judge, moving, (start, goal))
     if not pairs:

@@ -24,7 +24,7 @@ from hybrid_opt.extras.proposing.bases import (
     machine_places,
     shared_room,
 )
-from hybrid_opt.extras.proposing.common import MachineKinematics, machine_holds
+from hybrid_opt.extras.proposing.common import machine_holds
 from hybrid_opt.extras.proposing.holding import HoldQuery, clear_spins, find_holds, possible_spins
 from hybrid_opt.extras.proposing.kinematics import ArmKinematics, rotate_about_normal
 from hybrid_opt.extras.proposing.problem import Problem, read_problem
@@ -230,9 +230,9 @@ def test_a_waist_turns_where_the_box_is_beside_the_machine(machine: Setup) -> No
     turned = [
         np.array([0.40 * np.cos(a), 0.40 * np.sin(a), 0.85, 0.0, 0.0, a]) for a in (0.9, -0.9)
     ]
-    both = MachineKinematics([ArmKinematics(workcell, arm) for arm in (0, 1)])
+    arms = [ArmKinematics(workcell, arm) for arm in (0, 1)]
     query = HoldQuery(turned[0], turned[1], SPINS, None)
-    counts, found = machine_holds(query, both, np.random.default_rng(1))
+    counts, found = machine_holds(query, arms, np.random.default_rng(1))
     assert counts.within >= len(found) > 4
     for holds in found:
         for pose, end in zip(turned, ("q_start", "q_goal"), strict=True):
@@ -244,7 +244,7 @@ def test_a_waist_turns_where_the_box_is_beside_the_machine(machine: Setup) -> No
                 assert (q[arm] <= robot.position_upper).all()
                 data = model.createData()
                 pin.forwardKinematics(model, data, q[arm])
-                target = box_placement(task.orientation, pose) @ both.arms[arm].held(hold.spin)
+                target = box_placement(task.orientation, pose) @ arms[arm].held(hold.spin)
                 there = robot.T_world_base @ data.oMi[model.njoints - 1].homogeneous
                 np.testing.assert_allclose(there, target, atol=1e-5)
     waist = np.array([[hold.q_start[0], hold.q_goal[0]] for hold, _ in found])
