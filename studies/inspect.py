@@ -45,8 +45,8 @@ def _add_options(parser: Parser) -> None:
         "--yaws",
         type=whole(1, 36),
         metavar="N",
-        help="directions of the box, evenly over half a turn, or over a whole one if the file "
-        "places the pads (default: 4)",
+        help="directions of the box, evenly over half a turn, or over a whole one for hands, "
+        "and if the file places the pads (default: 4)",
     )
     parser.add_argument(
         "--candidates",

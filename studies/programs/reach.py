@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt.display.table import Table, number
+from hybrid_opt.display.table import Table, counted, number
 from hybrid_opt.extras.proposing.hold_map import (
     HeldPlace,
     HoldMap,
@@ -113,7 +113,7 @@ def _heights(found: HoldMap) -> ProgramResult:
     turns = ", ".join(f"{angle:.0f}" for angle in np.degrees(found.yaws))
     note = (
         f"Of {places} places {found.step:g} m apart at each height of the box centre; directions: "
-        f"turned by {turns} deg about the vertical; {len(found.ways)} ways to hold it tried."
+        f"turned by {turns} deg about the vertical; {counted(len(found.ways), 'way')} to hold it."
     )
     name = found.geometry.workcell.name
     table = Table("reach", f"{name}: where both arms can hold the box", header, tuple(rows), note)

@@ -174,7 +174,10 @@ def _draw_base(axes: Axes, robot: Robot, colour: str, middle: Array) -> None:
     """
     base = FROM_ABOVE.flat(robot.T_world_base[:3, 3])
     away = base - FROM_ABOVE.flat(middle)
-    away = away / max(float(np.linalg.norm(away)), 1e-9)
+    apart = float(np.linalg.norm(away))
+    # Both arms of one machine have one base.
+    up = 1.0 if colour == ARM_COLOURS[0] else -1.0
+    away = away / apart if apart > 1e-6 else np.array([0.0, up])
     axes.plot(*base, "o", color=colour, markersize=6.0, zorder=5.5)
     axes.annotate(
         shortened(robot.name, 16),

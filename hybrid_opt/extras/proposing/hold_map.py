@@ -61,7 +61,7 @@ class HoldMapSettings:
         heights: heights of the box centre in the world [m]; empty to choose `CHOSEN_HEIGHTS` from
             the lowest to the highest at which something holds.
         yaws: number of directions of the box, evenly over half a turn about the vertical; over a
-            whole turn if the file states where the pads are.
+            whole turn for hands, and if the file states where the pads are.
     """
 
     step: float | None = None
@@ -278,7 +278,8 @@ class _GridSearch:
         if not self.ways:
             text = "the robots' tools enter the payload in every way to hold it"
             raise ProposalError(f"{problem.source}: {text}")
-        turn = 2.0 * np.pi if problem.states_contacts else np.pi
+        is_whole = problem.states_contacts or problem.has_hands
+        turn = 2.0 * np.pi if is_whole else np.pi
         self.yaws = turn * np.arange(settings.yaws) / settings.yaws
         upright, orientation = problem.poses[0][3:], problem.orientation
         self._angles = np.array([turned(orientation, upright, float(yaw)) for yaw in self.yaws])
