@@ -211,12 +211,14 @@ class RosCell(ControlledCell):
         self._commands.publish(String(data=word))
 
     def heal(self) -> None:
-        """End every fault."""
+        """End every fault. An arm that stood holds where it is: its driver activates its controller
+        anew, as UR's does (ur_robot_driver, controller_stopper.cpp, `startControllers`)."""
         self.silent, self.felt, self._longest = [False, False], [0.0, 0.0], 0.0
         self.leaks = [False, False]
         for controller in self.controllers.values():
+            stood = bool(controller.stands.any())
             controller.stands[:] = controller.refuses = False
-            if not controller.is_active:
+            if stood or not controller.is_active:
                 controller.switch(True)
 
     def fault(self, name: str, arm: int) -> None:
