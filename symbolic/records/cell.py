@@ -384,9 +384,9 @@ that squeeze boxes (adamweinhardt/dual-arm-manipulation, commit 6699139, 206 run
 these logs contains the arms' relative angle. docs/explanation/robust.md says more."""
 
 
-PARTNER_TIME = 0.25
+PARTNER_TIME = 0.3
 """Time in which an arm at full speed covers the distance by which it still moves after the other
-arm has stopped (assumed) [s]: 0.16 s to notice and report the stop, a lag of 0.03 s, and half of a
+arm has stopped (assumed) [s]: 0.21 s to notice and report the stop, a lag of 0.03 s, and half of a
 stop of 0.12 s. Bundles compute their own."""
 
 
