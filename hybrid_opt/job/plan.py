@@ -538,13 +538,13 @@ class CommandedForces:
         squeeze: record of how the forces were computed.
         job: the whole job; None if no job can be planned. The forces are then computed for the
             carry alone.
-        problem: reason why no job can be planned, else ''.
+        problem: reason why no job can be planned, else None.
     """
 
     forces: Array
     squeeze: Squeeze
     job: Job | None
-    problem: str = ""
+    problem: JobError | None = None
 
 
 def command_forces(
@@ -565,7 +565,7 @@ def command_forces(
         job = model.plan(timing, settings)
     except JobError as error:
         forces, squeeze = commanded_forces(model.workcell, timing.driven, settings)
-        return CommandedForces(forces, squeeze, None, str(error))
+        return CommandedForces(forces, squeeze, None, error)
     carried = job.phase("carry")
     along = (carried.motion.time, carried.force.normal)
     time = job.timing.driven.time

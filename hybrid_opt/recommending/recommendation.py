@@ -68,6 +68,10 @@ acceleration fulfils the wish."""
 TRIED = 3
 """Number of paths that are timed within jerk limits before the best of them is chosen."""
 
+GENTLER = 3
+"""How often carries of less commanded force are tried at most, if the best carry's job exceeds a
+limit."""
+
 STEPS = 4 + FORCES
 """Number of steps of a recommendation, for a progress display. Each compared path adds one."""
 
@@ -214,12 +218,17 @@ def recommend(
             why = f"{wish}, of carries that all exceed the reference force"
         refuse(options, wish, goal, budget)
         option, timing, is_kept = _driven(cell, paths, options, goal, wish.has_target)
+        held = command_forces(job_model(cell.timing_model), timing)
         if not is_kept:
             why = "least excess over the reference force of the carries that were driven"
+        elif held.problem is not None and held.problem.code == "beyond-a-limit":
+            gentler = _with_job(cell, paths, options, goal, held.squeeze.force)
+            if gentler is not None:
+                option, timing, held = gentler
+                why = f"{why}, with less force, because the job with more exceeds a limit"
         advance(1)
         carry, limits = timing.carry, cell.timing_model.carry_limits
         assert carry is not None, "what is recommended has a timing"
-        held = command_forces(job_model(cell.timing_model), timing)
         forces, squeeze, job, doubts = held.forces, held.squeeze, held.job, _objections(held)
         commanded = np.asarray(forces.max(axis=0)) if job is None else job.peak_normal_force
         allowed, remedies = cell.workcell.task.reference_force, tuple[Remedy, ...]()
@@ -339,6 +348,37 @@ def _driven(
     if not kept and (wished or not others):
         raise SettingsError(f"no carry of the front can be driven as wished for: {reason}")
     return *min(kept or others, key=lambda each: each[0])[1], bool(kept)
+
+
+def _with_job(
+    cell: Cell, paths: DrivenPaths, options: Sequence[Option], goal: Goal, force: float
+) -> tuple[Option, Timing, CommandedForces] | None:
+    """Choose the carry to recommend among carries of less commanded force, which are slower, until
+    its job keeps all limits.
+
+    Timings limit joint torques under the planned forces, jobs under the commanded ones. The excess
+    over the least commanded force of all carries is halved each time.
+
+    Args:
+        cell, paths, options, goal: as for `_driven`.
+        force: commanded force of the carry whose job exceeds a limit [N].
+
+    Returns:
+        Path and force limit of the carry, its timing, and its commanded forces with the job; None
+        if no carry with a job was found.
+    """
+    least = min(option.commanded for option in options)
+    for _ in range(GENTLER):
+        force = (least + force) / 2.0
+        asked = replace(goal, hardest=commanded_at_most(force, goal.hardest))
+        try:
+            option, timing, _ = _driven(cell, paths, options, asked, wished=True)
+        except SettingsError:
+            return None
+        held = command_forces(job_model(cell.timing_model), timing)
+        if held.job is not None:
+            return option, timing, held
+    return None
 
 
 def required_forces(workcell: Workcell, carry: Carry) -> Array:

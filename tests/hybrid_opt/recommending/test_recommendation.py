@@ -11,8 +11,10 @@ from scipy.optimize import brentq
 
 import hybrid_opt as ho
 from hybrid_opt.carry import BoxMotion
+from hybrid_opt.errors import JobError
 from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
 from hybrid_opt.job.plan import JobModel
+from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.recommending.advice import changes_of_cell
 from hybrid_opt.recommending.choice import DrivenPaths
 from hybrid_opt.recommending.recommendation import (
@@ -131,6 +133,25 @@ def test_one_duration_and_one_force(drivable: ho.Cell, found: Recommendation) ->
     assert f"{found.duration:.3f} s" in repr(found)
     assert f"{found.force:.1f} N" in repr(found)
     assert sum(part.force for part in found.squeeze.parts) == pytest.approx(found.force)
+
+
+def test_a_job_beyond_a_limit_gives_way_to_a_gentler_carry(
+    drivable: ho.Cell, front: ho.Front, found: Recommendation
+) -> None:
+    """Where arms are so weak that they may not press as hard as in the best carry's job."""
+    assert found.job is not None
+    share = 0.95 * found.job.phase("carry").use["joint torque"]
+    robots = enumerate(drivable.workcell.robots)
+    weak = drivable.changed(
+        {f"robots[{k}].torque_max": share * robot.torque_max for k, robot in robots}
+    )
+    with refused(JobError, "beyond-a-limit", "joint torque"):
+        ho.plan_job(driven_timing(weak.timing_model, found.x))
+    answer = ho.recommend(ho.Front.of(weak, front.x), alone=True)
+    assert answer.job is not None
+    assert not answer.warnings
+    assert answer.force < found.force
+    assert answer.duration > found.duration
 
 
 def test_limits_on_jerk_are_kept(drivable: ho.Cell, found: Recommendation) -> None:
