@@ -214,7 +214,7 @@ def with_contents(_: Any, name: str, source: list[str]) -> None:
     if name != "index":
         return
     for section in source[0].split("\n## ")[1:]:
-        caption = section.partition(":")[0]
+        caption = section.partition("\n")[0]
         pages = [*re.findall(r"\]\((.+?)\.md\)", section), *GENERATED.get(caption, [])]
         listed = "\n".join(pages)
         source[0] += f"\n```{{toctree}}\n:hidden:\n:caption: {caption}\n\n{listed}\n```\n"
