@@ -118,7 +118,8 @@ def _lines(tried: list[ProblemAttempt]) -> Iterator[str]:
     rows: list[tuple[str, ...]] = [head]
     for one in tried:
         figures = (one.certified, one.seconds, one.length, one.duration, one.force)
-        note = one.problem_met or one.passes
+        # The reason's first line; with --json the whole.
+        note = one.problem_met.partition("\n")[0] or one.passes
         if one.allowed is False:
             note += ", beyond the reference force"
         rows.append((one.problem, str(one.seed), *map(number, figures), note))
@@ -158,11 +159,14 @@ def _add_options(parser: Parser) -> None:
 
 def _run(options: argparse.Namespace) -> int:
     paths = [Path(path) for path in options.problems] or shipped_problems()
-    tried = [
-        attempt(path, seed, options.time, options.recommend)
-        for path in paths
-        for seed in range(1, options.seeds + 1)
-    ]
+    from hybrid_opt.progress import progress_bar
+
+    tried = []
+    with progress_bar(True, "proposals", len(paths) * options.seeds) as advance:
+        for path in paths:
+            for seed in range(1, options.seeds + 1):
+                tried.append(attempt(path, seed, options.time, options.recommend))
+                advance(1)
     if options.json:
         print(json.dumps([asdict(one) for one in tried], indent=1))
     else:
