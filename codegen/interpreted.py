@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import casadi as ca
 import numpy as np
@@ -17,7 +18,7 @@ from codegen.build import compile_function
 from codegen.cache import Cache
 from codegen.errors import CodegenError
 from codegen.function import NumericFunction, Signature
-from codegen.native import Tape, TapeFunction
+from codegen.native import Tape, TapeFunction, thread_pool
 from codegen.source import dense
 from symbolic.array import Array
 
@@ -52,7 +53,33 @@ class InterpretedFunction(NumericFunction):
         n: int,
         threads: int,
     ) -> None:
-        # One evaluation's memory serves all: CasADi gets addresses once a batch.
+        pieces = min(n, threads)
+        bounds = [n * piece // pieces for piece in range(pieces + 1)]
+
+        def evaluate(part: tuple[int, int]) -> None:
+            self._evaluate_range(inputs, batched, outputs, *part)
+
+        if pieces == 1:
+            evaluate((0, n))
+        else:
+            # CasADi's interpreter lets other threads run meanwhile.
+            list(thread_pool().map(evaluate, pairwise(bounds)))
+
+    def _evaluate_range(
+        self,
+        inputs: Sequence[Array],
+        batched: Sequence[bool],
+        outputs: Sequence[Array],
+        begin: int,
+        end: int,
+    ) -> None:
+        """Evaluate a range of a batch, one evaluation after another.
+
+        Args:
+            inputs, batched, outputs: as for `NumericFunction._evaluate_batch`.
+            begin, end: numbers of the first evaluation and of the one after the last.
+        """
+        # One evaluation's memory serves all: CasADi gets addresses once a range.
         own = [
             np.empty(array.shape[1:]) if per else array
             for array, per in zip(inputs, batched, strict=True)
@@ -62,7 +89,7 @@ class InterpretedFunction(NumericFunction):
             (array, one) for array, one, per in zip(inputs, own, batched, strict=True) if per
         ]
         evaluate = self._evaluator(own, found)
-        for k in range(n):
+        for k in range(begin, end):
             for array, one in changing:
                 one[...] = array[k]
             evaluate()

@@ -414,7 +414,7 @@ class Trial:
         vars(model)["screening"] = self.bodies.screening  # of the same bodies: not made again
         self.workcell, self.model, self.branches = workcell, model, workcell.start_branch
         interpreted = InterpretedCell(self.workcell, model=model)
-        self.evaluator = CandidateEvaluator(self.workcell, compiled=interpreted)
+        self.evaluator = CandidateEvaluator(self.workcell, compiled=interpreted, threads=0)
         # Forces that a solver finds take most of a candidate's time.
         self._solved = not contact_model(self.workcell).has_closed_form
         self._motion = interpret(motion_function(model)) if self._solved else None
