@@ -86,8 +86,9 @@ def _heights(text: str | None) -> tuple[float, ...]:
     try:
         return tuple(float(part) for part in (text or "").split(",") if text)
     except ValueError as error:
-        told = f"--heights: found {text!a}; allowed are numbers with commas between [m]"
-        raise SettingsError(told) from error
+        raise SettingsError(
+            f"--heights: found {text!a}; allowed are numbers with commas between [m]"
+        ) from error
 
 
 def _complete(options: argparse.Namespace) -> None:
@@ -96,8 +97,8 @@ def _complete(options: argparse.Namespace) -> None:
     others = ("polish", "view", "pairs") if options.reach else ("heights", "step", "yaws")
     for name in others:
         if getattr(options, name):
-            told = "does not go with" if options.reach else "needs"
-            raise SettingsError(f"--{name} {told} --reach")
+            relation = "does not go with" if options.reach else "needs"
+            raise SettingsError(f"--{name} {relation} --reach")
 
 
 main = Program(

@@ -128,7 +128,7 @@ def _best(found: HoldMap, best: HeldPlace) -> ProgramResult:
         f"{robot.name} at {_pose_text(np.array(contact['xyz']))} m of the box"
         for robot, contact in zip(robots, best.contacts, strict=True)
     )
-    told = (
+    lines = (
         "",
         f"Best place, with {100.0 * best.comfort:.0f} % comfort (0: at a joint limit, singular)",
         f"  held by {held}",
@@ -139,7 +139,7 @@ def _best(found: HoldMap, best: HeldPlace) -> ProgramResult:
         "contacts": [contact["xyz"] for contact in best.contacts],
         "comfort": best.comfort,
     }
-    return ProgramResult(values, told)
+    return ProgramResult(values, lines)
 
 
 def _pose_text(pose: Array) -> str:
@@ -148,15 +148,15 @@ def _pose_text(pose: Array) -> str:
 
 def _nowhere(problem: Problem, found: HoldMap, spins: Array, seed: int) -> ProgramResult:
     """Return why nothing holds, and the least changes with which something does."""
-    state, told = found.state, []
+    state, reasons = found.state, []
     for kind, text in (
         (PoseState.OUT_OF_REACH, "an arm has no posture within its limits that reaches"),
         (PoseState.COLLIDES, "both arms reach, but collide"),
         (PoseState.MEETS_SCENE, "the box itself collides"),
     ):
         share = float((state == kind).mean())
-        told += [f"{text}: {100.0 * share:.0f} %"] if share else []
-    lines = ["", f"Both arms can hold the box nowhere. Of the poses tried: {'; '.join(told)}."]
+        reasons += [f"{text}: {100.0 * share:.0f} %"] if share else []
+    lines = ["", f"Both arms can hold the box nowhere. Of the poses tried: {'; '.join(reasons)}."]
     changes = _least_changes(problem, spins, seed)
     if changes:
         lines.append(f"Both could hold it with {changes}.")

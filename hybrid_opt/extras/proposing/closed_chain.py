@@ -80,7 +80,7 @@ class _Follower:
         key = f"robots[{many.arm}].min_manipulability = {robot.min_manipulability:g} m^3"
         self.singular = f"{robot.name} is near a singular posture ({key})"
         self.side = many.side(hold.q_start)
-        self.load = StaticLoad(many.workcell, many.arm, model)
+        self.load = StaticLoad(many.workcell, many.arm)
         self.heavy = f"holding the box still takes too much torque of {robot.name}"
         ends = zip((start, goal), (hold.q_start, hold.q_goal), strict=True)
         taken = [self.load.share(pose[None], q[None], self.T_box_joint)[0] for pose, q in ends]

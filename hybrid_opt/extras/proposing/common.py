@@ -38,7 +38,6 @@ from hybrid_opt.extras.proposing.kinematics import (
 )
 from hybrid_opt.extras.proposing.static_load import MOST_TORQUE, StaticLoad
 from symbolic.array import Array
-from symbolic.read.arms import arm_model
 from symbolic.records.poses import box_placement
 
 MACHINE_STARTS = 512
@@ -201,9 +200,7 @@ class _MachineSearch:
         arms = machine.arms
         workcell = arms[0].workcell
         self._orientation = workcell.task.orientation
-        self._loads = [
-            StaticLoad(workcell, arm.arm, arm_model(workcell.robots[arm.arm])) for arm in arms
-        ]
+        self._loads = [StaticLoad(workcell, arm.arm) for arm in arms]
         possible = (possible_spins(workcell.contacts[arm.arm], query.spins) for arm in arms)
         self._spins = [clear_spins(query, *both) for both in zip(arms, possible, strict=True)]
         self._held = [

@@ -15,6 +15,7 @@ from scipy import ndimage
 from scipy.spatial.transform import Rotation
 
 from hybrid_opt.errors import ProposalError
+from hybrid_opt.extras.proposing.common import MachineKinematics
 from hybrid_opt.extras.proposing.hold_search import (
     LIBRARY,
     PoseSearch,
@@ -359,9 +360,9 @@ def _common_positions(
     are no such joints."""
     if not arms[0].common:
         return [None]
-    spans = [arm.span[:, arm.common] for arm in arms]
-    low, high = np.maximum(spans[0][0], spans[1][0]), np.minimum(spans[0][1], spans[1][1])
-    return [np.clip(0.0, low, high), *rng.uniform(low, high, (COMMON_POSITIONS - 1, len(low)))]
+    machine = MachineKinematics(arms)
+    rest, low, high = (x[: machine.common] for x in (machine.rest, machine.lower, machine.upper))
+    return [rest, *rng.uniform(low, high, (COMMON_POSITIONS - 1, len(rest)))]
 
 
 def _library(arm: ArmKinematics, seed: int, common: Array | None) -> PostureLibrary:

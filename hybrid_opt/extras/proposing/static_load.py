@@ -7,6 +7,7 @@ import pinocchio as pin
 
 from hybrid_opt.static_hold import static_hold
 from symbolic.array import Array
+from symbolic.read.arms import arm_model
 from symbolic.records import POSE_SIZE, Workcell
 from symbolic.records.poses import box_placement
 from symbolic.records.quantities import GRAVITY
@@ -32,16 +33,15 @@ class StaticLoad:
         checked: False for a strong arm, for which every share counts as zero.
     """
 
-    def __init__(self, workcell: Workcell, arm: int, model: pin.Model) -> None:
+    def __init__(self, workcell: Workcell, arm: int) -> None:
         """Prepare the torques of an arm.
 
         Args:
             workcell: the cell.
             arm: index of the arm.
-            model: its Pinocchio model (`symbolic.read.arms.arm_model`).
         """
         robot, contact = workcell.robots[arm], workcell.contacts[arm]
-        self._model, self._limit = model.copy(), robot.torque_max
+        self._model, self._limit = arm_model(robot).copy(), robot.torque_max
         self._model.gravity.linear = gravity_in_root(robot.T_world_base)
         self._data, self._still = self._model.createData(), np.zeros(self._model.nv)
         self._forces = pin.StdVec_Force()

@@ -1,4 +1,4 @@
-"""Where both arms can hold the box, as a program tells and draws it."""
+"""Where both arms can hold the box, as `inspect --reach` prints and draws it."""
 
 from __future__ import annotations
 

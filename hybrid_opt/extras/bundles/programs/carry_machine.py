@@ -488,8 +488,8 @@ class Machine:
         """
         limits, s = self.job.limits, self.clock.s
         # Nothing is lifted or let go, and no job done, by an arm that stands elsewhere.
-        stands = self.job.is_gripped(s) or s in (0.0, self.job.end)
-        stands = stands or (self.job.phase(s) == "release" and not self.job.is_standing)
+        releases = self.job.phase(s) == "release" and not self.job.is_standing
+        stands = self.job.is_gripped(s) or releases or s in (0.0, self.job.end)
         most = limits.path / 2.0 if stands else limits.path
         coordinates = []
         direction = 1.0 if self.clock.rate >= 0.0 else -1.0

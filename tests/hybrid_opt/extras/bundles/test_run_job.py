@@ -270,9 +270,10 @@ def test_a_held_job_sets_the_box_down(driver: str, word: str, code: int, tmp_pat
         ("set_down", 0.1),
         *(
             pytest.param(phase, share, marks=pytest.mark.slow)
-            for phase in ("lift", "carry", "set_down")
+            # At the end of the set-down an arm that stops stands where it has to.
+            for phase, last in (("lift", 1.0), ("carry", 1.0), ("set_down", 0.6))
             for share in (0.02, 0.25, 0.5, 0.75, 0.98)
-            if (phase, share) < ("set_down", 0.6)
+            if share < last
         ),
     ],
 )

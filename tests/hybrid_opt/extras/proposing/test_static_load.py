@@ -47,7 +47,7 @@ def test_torques_at_rest_are_the_slope_of_the_energy(arm: int, end: str) -> None
 
     steps = 1e-5 * np.eye(len(q))
     slope = np.array([energy(q + step) - energy(q - step) for step in steps]) / 2e-5
-    loaded = StaticLoad(cell, arm, model)
+    loaded = StaticLoad(cell, arm)
     assert loaded.checked
     found = loaded.share(pose[None], q[None], T_box_joint)
     np.testing.assert_allclose(found, np.abs(slope / robot.torque_max).max(), rtol=1e-5)
@@ -57,6 +57,6 @@ def test_torques_at_rest_are_the_slope_of_the_energy(arm: int, end: str) -> None
 def test_torques_of_strong_arms_and_unknown_ones_are_not_limited(share: float) -> None:
     cell = load(RACK)
     robot = replace(cell.robots[0], torque_max=share * cell.robots[0].torque_max)
-    found = StaticLoad(replace(cell, robots=(robot, cell.robots[1])), 0, arm_model(robot))
+    found = StaticLoad(replace(cell, robots=(robot, cell.robots[1])), 0)
     assert not found.checked
     np.testing.assert_array_equal(found.share(np.zeros((2, 6)), np.zeros((2, 6)), np.eye(4)), 0.0)
