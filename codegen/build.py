@@ -149,7 +149,7 @@ class StoredTape:
     tape: Tape
 
     def function(self) -> TapeFunction:
-        """Return the tape as a numeric function."""
+        """Return the tape, the instructions of a CasADi function, as a numeric function."""
         return TapeFunction(self.tape)
 
 

@@ -116,7 +116,8 @@ class InterpretedFunction(NumericFunction):
 def interpret(function: ca.Function) -> NumericFunction:
     """Return a numeric function without compiling.
 
-    The function runs from its tape if it has one (`Tape.of`), else by CasADi's interpreter.
+    A small C++ module runs the function's instructions (`Tape.of`) if it knows them all, else
+    CasADi's interpreter does.
     """
     tape = Tape.of(function)
     return InterpretedFunction(function) if tape is None else TapeFunction(tape)

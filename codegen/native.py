@@ -356,7 +356,8 @@ output the operands are its place."""
 
 @cache
 def compiled_tape() -> Any:
-    """Import the C++ extension module that runs tapes, and return the module.
+    """Import the C++ extension module that runs tapes (instructions of CasADi functions), and
+    return it.
 
     Raises:
         BridgeError: the module is missing or cannot be loaded.

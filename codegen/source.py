@@ -188,7 +188,7 @@ def _filled(driver: str, signature: Signature, generated: str = "") -> str:
     Args:
         driver: C text with placeholders.
         signature: name and sizes of the function.
-        generated: C code of the function, searched for whether it keeps state.
+        generated: C code of the function; the driver must know whether this code keeps state.
     """
     inputs = [prod(shape) for shape in signature.input_shapes]
     outputs = [prod(shape) for shape in signature.output_shapes]

@@ -95,7 +95,8 @@ def build_cell_bodies(workcell: Workcell, known: CellBodies | None = None) -> Ce
 
 
 def _compared(bodies: CellBodies) -> tuple[object, ...]:
-    """Return what decides which distances the cell's functions compute.
+    """Return the pairs of bodies whose distances the functions of a cell compute. Cells with equal
+    results can share these functions.
 
     Returns:
         Indices of the possible pairs of bodies, near pairs first; and the number of near pairs.

@@ -48,8 +48,8 @@ def reached(
     output: Path | None = None,
     progress: Progress | None = None,
 ) -> Iterator[ProgramResult]:
-    """Yield where both arms can hold the box at once, and the picture of it; where they can
-    nowhere, the least changes with which they can.
+    """Yield a map of the box poses that both arms can hold at once, the best pose, and the picture.
+    If there is no such pose, yield the reasons and the least changes of the cell that allow one.
 
     Args:
         problem: the problem, with bases.
@@ -80,7 +80,10 @@ def reached(
 
 
 def _heights(found: HoldMap) -> ProgramResult:
-    """Return how many places hold at each height, with the best one."""
+    """Return a table with a row for each height: the share of the grid's positions at which both
+    arms
+    can hold the box, and the best pose.
+    """
     places, rows, values = found.directions[0].size, [], []
     for level, height in enumerate(found.z):
         some = int((found.directions[level] > 0).sum())
@@ -122,7 +125,7 @@ def _heights(found: HoldMap) -> ProgramResult:
 
 
 def _best(found: HoldMap, best: HeldPlace) -> ProgramResult:
-    """Return the best place, as it can stand in a file."""
+    """Return the best box pose and the contacts that hold it, in the form of a workcell file."""
     robots = found.geometry.workcell.robots
     held = " and ".join(
         f"{robot.name} at {_pose_text(np.array(contact['xyz']))} m of the box"
@@ -147,7 +150,16 @@ def _pose_text(pose: Array) -> str:
 
 
 def _nowhere(problem: Problem, found: HoldMap, spins: Array, seed: int) -> ProgramResult:
-    """Return why nothing holds, and the least changes with which something does."""
+    """Return why both arms can hold the box at no pose of the map, and the least changes of the
+    cell
+    that allow it.
+
+    Args:
+        problem: the problem.
+        found: the map, on which no pose can be held.
+        spins: rotations of a pad about its normal to try [rad].
+        seed: seed of the random postures.
+    """
     state, reasons = found.state, []
     for kind, text in (
         (PoseState.OUT_OF_REACH, "an arm has no posture within its limits that reaches"),
@@ -171,8 +183,9 @@ def _kinds() -> list[ProblemChange]:
 
 
 def _least_changes(problem: Problem, spins: Array, seed: int) -> str | None:
-    """Return the least changes of bases and tools with which something holds; '' for none, None if
-    the file does not state what they move."""
+    """Return text on the least changes of bases and tools with which both arms can hold the box at
+    some pose: '' if no tried change is enough, None if the file states neither bases nor tools.
+    """
     if not states_machine(problem):
         return None
     last = worked() + REMEDY_SECONDS

@@ -66,8 +66,9 @@ Classes = tuple[tuple[str, int, int], ...]
 
 
 def holdable_places(found: HoldMap) -> Figure:
-    """Draw for each height from above where both arms can hold the box, by the number of its
-    directions that hold; and the best place with the box and both arms.
+    """Draw a map of the box positions that both arms can hold: one panel for each height, seen from
+    above, with the number of directions of the box in which they hold it as colour. The best pose
+    is drawn with the box and both arms.
 
     Args:
         found: the map.
@@ -112,8 +113,10 @@ def holdable_places(found: HoldMap) -> Figure:
 
 
 def _classes(yaws: int) -> Classes:
-    """Divide the numbers of directions, from 1 on, into at most `MOST_SHADES` classes of one
-    colour each, dark for many."""
+    """Divide the numbers 1 to `yaws` of directions of the box into at most `MOST_SHADES` classes
+    with
+    one colour each, dark for many directions.
+    """
     edges = np.unique(np.linspace(0, yaws, min(yaws, MOST_SHADES) + 1).round().astype(int))
     shades = mpl.colormaps["YlGn"](np.linspace(0.3, 0.9, len(edges) - 1) if yaws > 1 else [0.7])
     return tuple(
@@ -123,8 +126,9 @@ def _classes(yaws: int) -> Classes:
 
 
 def _extent(found: HoldMap) -> Array:
-    """Return points (n, 3) of the world [m] that a panel must contain: the places that hold or
-    collide, and the robots' bases."""
+    """Return points (n, 3) of the world [m] that a panel must contain: the box positions that both
+    arms reach, with or without collisions, and the robots' bases.
+    """
     geometry, half = found.geometry, found.step / 2.0
     state = found.state
     reached = (state == PoseState.HOLDS) | (state == PoseState.COLLIDES)
@@ -194,13 +198,13 @@ def _draw_base(axes: Axes, robot: Robot, colour: str, middle: Array) -> None:
 
 
 def _draw_places(axes: Axes, found: HoldMap, level: int, classes: Classes) -> None:
-    """Fill the squares of the places at one height.
+    """Fill the grid squares of the box positions at one height.
 
     Args:
         axes: the panel.
         found: the map.
         level: index of the height.
-        classes: colours by the number of directions that hold.
+        classes: colours by the number of directions in which both arms hold the box.
     """
     directions, state = found.directions[level], found.state[level]
     for colour, low, high in classes:
@@ -220,12 +224,12 @@ def _fill(
     hatch: str = "",
     edge: str = "none",
 ) -> None:
-    """Fill the squares of some places.
+    """Fill the grid squares of some box positions.
 
     Args:
         axes: the panel.
         found: the map.
-        places: (ny, nx) True for these places.
+        places: (ny, nx) True for the positions to fill.
         colour, hatch, edge: how Matplotlib draws a square.
     """
     step = found.step or 0.1
@@ -241,13 +245,13 @@ def _fill(
 
 
 def _draw_place(axes: Axes, geometry: CellGeometry, place: HeldPlace, chosen: bool) -> None:
-    """Draw the outline of the box at a place, and both arms from joint to joint.
+    """Draw the outline of the box at a pose, and both arms from joint to joint.
 
     Args:
         axes: the panel.
         geometry: bodies of the cell.
         place: pose of the box and posture of the arms.
-        chosen: True for the best place of all heights.
+        chosen: True for the best pose of all heights.
     """
     T_world_box = box_placement(geometry.workcell.task.orientation, place.pose)
     corners = np.concatenate(

@@ -124,8 +124,8 @@ class LocalEven:
         """Compute the barrier's derivatives at an iterate, and the attributes `weight` and `trust`.
 
         `weight` is the weight in the iterate or, if larger, x . z / `DEGREE` with state x and
-        multipliers z. `trust` falls from 1 to `LEAST_TRUST` as z departs from its value on the
-        central path.
+        multipliers z. `trust` is the share of the way to the cone's boundary up to which a step may
+        go. It falls from 1 to `LEAST_TRUST` as z departs from its value on the central path.
 
         Args:
             patch: the patch.

@@ -122,12 +122,12 @@ def has_force_closure(workcell: Workcell) -> bool:
 
 
 def equal_pressure_rows(workcell: Workcell) -> Array:
-    """Return a matrix (k, pads) whose product with the pads' normal forces is zero if those pads
-    press with equal pressure that have to.
+    """Return a matrix (k, pads) that states which pads press with equal pressure: its product with
+    the pads' normal forces is zero if they do.
 
-    These are pads of one arm with the same normal, because the arm keeps the orientation of their
-    common plane. Each of the k rows compares two of them. Pads with different normals have no row:
-    they press as the motion requires.
+    Pads of one arm with the same normal have to press with equal pressure, because the arm keeps
+    the orientation of their common plane. Each of the k rows compares two of them. Pads with
+    different normals have no row: they press as the motion requires.
     """
     pads, robots, rows = workcell.pads, workcell.pad_robots, []
     for k in range(1, len(pads)):

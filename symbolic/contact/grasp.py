@@ -175,9 +175,9 @@ class Grasp:
                 patch sizes (2,) if the program has this input.
 
         Returns:
-            State (4,) of each pad, in balance with the load; and a scalar that sets the initial
-            weight of the barriers: this weight times the sum of the patches' degrees, over the
-            effort.
+            State (4,) of each pad, in balance with the load; and a scalar s: the initial weight
+            of the barriers is s times the effort at these states, over the sum of the patches'
+            degrees.
         """
         load, *sizes = cell[: 1 + len(SCALING_INPUTS)]
         given, rest = self.squeeze_states(*sizes), ca.SX(number(self.numbers.load_at_rest))
@@ -235,8 +235,9 @@ class Grasp:
         return replace(self.numbers, rest=rest, rest_slopes=slopes)
 
     def _nominal(self) -> tuple[list[float], ...]:
-        """Return the workcell's own values of all inputs of the convex program except the load.
-        Here this is one list, the friction coefficients (2,)."""
+        """Return the workcell's own values of all inputs of the convex program except the load: a
+        tuple with one list, the friction coefficients (2,).
+        """
         return (np.array(ca.evalf(self.friction)).ravel().tolist(),)
 
     def least_states(self, load: ca.SX, friction: ca.SX, reach: ca.SX = WHOLE) -> list[ca.SX]:

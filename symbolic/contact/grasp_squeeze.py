@@ -70,8 +70,9 @@ class GraspSqueeze(Grasp):
         """Return the workcell's own values of all inputs of the convex program except the load.
 
         Returns:
-            Friction (2,), relative patch sizes (2,), which are 1, and displacements (4,), which are
-            0.
+            Friction coefficients (2,); relative patch sizes (2,), which are 1; and displacements
+            (4,),
+            which are 0.
         """
         return (*super()._nominal(), [1.0, 1.0], [0.0] * 4)
 

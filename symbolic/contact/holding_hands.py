@@ -281,11 +281,11 @@ class HoldingHands(ContactModel):
         return float(ca.evalf(ca.mmax(self.hold(load).normal)))
 
     def limited_force(self, normal: Array, whole: Array) -> Array:
-        """Return `normal`: the reference force, which is the holding force, limits the needed
-        holding force (2,) of each arm's hands [N].
+        """Return for each arm the force (2,) [N] that its reference force limits: for hands the
+        holding force that the load needs, because the reference force is the holding force.
 
         Args:
-            normal: (2,) needed holding force of each arm's hands [N].
+            normal: (2,) needed holding force of each arm's hands [N], which is returned.
             whole: not used.
         """
         return normal

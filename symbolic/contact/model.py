@@ -395,14 +395,18 @@ class ContactModel(ABC):
 
     @property
     def strength(self) -> float:
-        """Holding force of the weakest hand [N], by which the forces of changed cells are compared;
-        1 for pads, which have none."""
+        """Holding force of the weakest hand [N]; 1 for pads. An advice divides the forces of
+        changed
+        cells by it, so that cells with weaker and stronger hands can be compared.
+        """
         return 1.0
 
     @property
     def own_changes(self) -> dict[str, Callable[[Contact], Contact]]:
-        """Small changes of the contacts that only this model knows, by their text in an advice:
-        functions from a pad to its changed copy."""
+        """Small changes of the contacts that an advice to the user may propose only with this
+        contact
+        model: functions from a pad to its changed copy, by the text of the advice.
+        """
         return {}
 
     # --- jobs ---

@@ -30,7 +30,7 @@ def squeeze_problem(workcell: Workcell, purpose: str) -> str:
 
     Args:
         workcell: the cell.
-        purpose: subject of the message: what needs pads that press.
+        purpose: subject of the message, such as 'a simulation of pads'.
     """
     if contact_model(workcell).is_squeeze:
         return ""
@@ -45,7 +45,7 @@ def require_squeeze(workcell: Workcell, purpose: str) -> None:
 
     Args:
         workcell: the cell.
-        purpose: subject of the error's message: what needs pads that press.
+        purpose: subject of the error's message, such as 'a simulation of pads'.
 
     Raises:
         SettingsError: the workcell has hands that hold without a squeeze.

@@ -215,7 +215,7 @@ def case_slack_function(workcell: Workcell, commanded: int = 1) -> ca.Function:
 def _program_and_inputs(
     workcell: Workcell, commanded: int = 1
 ) -> tuple[GraspSqueeze | None, dict[str, Expression]]:
-    """Return what functions of least normal forces are built from.
+    """Return the convex program and the input symbols of functions of least normal forces.
 
     Args:
         workcell: the cell.

@@ -70,7 +70,7 @@ class ImportedScene:
 
         Args:
             folder: folder of the workcell file, to which mesh paths are relative.
-            meshes: folder that contains `files`.
+            meshes: folder to which the scene's mesh files (the attribute `files`) are written.
         """
         return [_table(body, folder, meshes) for body in self.bodies]
 

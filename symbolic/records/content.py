@@ -51,8 +51,7 @@ def digest_of_parts(value: Any, folder: Path = Path()) -> str:
 
 
 def _counted(part: bytes) -> bytes:
-    """Return bytes with their length in front, so that a sequence of such parts has one meaning
-    only."""
+    """Return bytes with their length in front, so that a sequence of such parts is unambiguous."""
     return len(part).to_bytes(8, "big") + part
 
 
@@ -95,7 +94,8 @@ def _array_head(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
 
 @cache
 def _record(kind: Hashable) -> tuple[bytes, tuple[str, ...]]:
-    """Return what the content of every record of a class has in common.
+    """Return the constants of a record class from which the content of each of its records is
+    formed.
 
     Returns:
         The bytes with which the content begins: the class name with its length in front; and the

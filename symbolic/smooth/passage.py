@@ -132,7 +132,7 @@ class SeparatingAxisGap(PathConstraint):
         """Build the expression of the gap [m].
 
         Args:
-            place: symbols of a place of the path.
+            place: symbols of the box pose and the joints at one point of the path.
             numbers: (count,) parameters of the obstacle, then coefficients of the direction.
         """
         return gap(place, numbers[:BOX_NUMBERS], numbers[BOX_NUMBERS:])

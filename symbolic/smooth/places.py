@@ -126,15 +126,16 @@ class PathConstraint(ABC):
     @property
     @abstractmethod
     def family(self) -> str:
-        """Name that all constraints have in common which share their compiled functions, such as
-        all joint limits of one arm."""
+        """Name shared by all constraints that use the same compiled functions, such as all joint
+        limits of one arm.
+        """
 
     @abstractmethod
     def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
         """Build the expression of the constrained value [m, rad or 1], a scalar.
 
         Args:
-            place: symbols of the box pose and the joints at one place of the path.
+            place: symbols of the box pose and the joints at one point of the path.
             numbers: (count,) symbols of the parameters that distinguish the constraints of the
                 family.
         """
@@ -312,7 +313,7 @@ def closure_name(arm: int, order: Order) -> str:
 
 
 def row_function(place: PathPointSymbols, constraint: PathConstraint, order: Order) -> ca.Function:
-    """Build the function of a family of constraints and its derivatives at one place of the path.
+    """Build the function of a family of constraints and its derivatives at one point of the path.
 
     The variables y (n_y,) of the derivatives are the pose (6,), then its rate (6,) if the
     constraint is `moving`, then the joints of its `arms`. Inputs: pose, rate, q_1, q_2; numbers,
@@ -320,7 +321,7 @@ def row_function(place: PathPointSymbols, constraint: PathConstraint, order: Ord
     the cell's symbolic parameters.
 
     Args:
-        place: symbols of a place of the path.
+        place: symbols of the box pose and the joints at one point of the path.
         constraint: any constraint of the family.
         order: 'first' for the outputs value (scalar) and gradient (n_y,); 'second' for the output
             hessian (n_y, n_y), multiplied by weight.

@@ -256,12 +256,12 @@ def _ramped(
 
 
 def drive(task: Task, length: float, total: float) -> tuple[float, float, float]:
-    """Compute time [s], speed [m/s] and acceleration [m/s^2] at a place of a motion from rest to
+    """Compute time [s], speed [m/s] and acceleration [m/s^2] at a point of a motion from rest to
     rest.
 
     Args:
         task: task with the reference speed and the time of the ramps.
-        length: length covered at this place [m].
+        length: length covered at this point [m].
         total: length of the whole path [m].
     """
     ramp, cruise = task.ramp_time, min(task.reference_speed, total / task.ramp_time)
