@@ -81,8 +81,7 @@ def reached(
 
 def _heights(found: HoldMap) -> ProgramResult:
     """Return a table with a row for each height: the share of the grid's positions at which both
-    arms
-    can hold the box, and the best pose.
+    arms can hold the box, and the best pose.
     """
     places, rows, values = found.directions[0].size, [], []
     for level, height in enumerate(found.z):
@@ -151,8 +150,7 @@ def _pose_text(pose: Array) -> str:
 
 def _nowhere(problem: Problem, found: HoldMap, spins: Array, seed: int) -> ProgramResult:
     """Return why both arms can hold the box at no pose of the map, and the least changes of the
-    cell
-    that allow it.
+    cell that allow it.
 
     Args:
         problem: the problem.

@@ -139,8 +139,8 @@ def _tell(outcome: ArmOutcome, carry: Carry) -> None:
 def _cases(
     cell: Cell, pressed: Reference, settings: ArmSettings, options: argparse.Namespace
 ) -> None:
-    """Simulate random cases of the uncertainty with errors of the joints, and print in how many
-    of them the box arrives at its goal.
+    """Simulate random cases of the uncertainty with errors of the joints, and print in how many of
+    them the box arrives at its goal.
 
     Args:
         cell: the cell.

@@ -141,8 +141,7 @@ def shortened(name: str, length: int = 24) -> str:
 
 def new_figure(share: float) -> Figure:
     """Create an empty figure as wide as a journal's page, with a height of `share` times the width.
-    Call this function, and draw the figure, inside
-    `in_style`.
+    Call this function, and draw the figure, inside `in_style`.
     """
     return Figure(figsize=(FULL_WIDTH, share * FULL_WIDTH), layout="constrained")
 

@@ -114,8 +114,7 @@ def holdable_places(found: HoldMap) -> Figure:
 
 def _classes(yaws: int) -> Classes:
     """Divide the numbers 1 to `yaws` of directions of the box into at most `MOST_SHADES` classes
-    with
-    one colour each, dark for many directions.
+    with one colour each, dark for many directions.
     """
     edges = np.unique(np.linspace(0, yaws, min(yaws, MOST_SHADES) + 1).round().astype(int))
     shades = mpl.colormaps["YlGn"](np.linspace(0.3, 0.9, len(edges) - 1) if yaws > 1 else [0.7])

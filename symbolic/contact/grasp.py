@@ -175,8 +175,8 @@ class Grasp:
                 patch sizes (2,) if the program has this input.
 
         Returns:
-            State (4,) of each pad, in balance with the load; and a scalar s: the initial weight
-            of the barriers is s times the effort at these states, over the sum of the patches'
+            State (4,) of each pad, in balance with the load; and a scalar s: the initial weight of
+            the barriers is s times the effort at these states, over the sum of the patches'
             degrees.
         """
         load, *sizes = cell[: 1 + len(SCALING_INPUTS)]

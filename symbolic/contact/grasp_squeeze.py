@@ -71,8 +71,7 @@ class GraspSqueeze(Grasp):
 
         Returns:
             Friction coefficients (2,); relative patch sizes (2,), which are 1; and displacements
-            (4,),
-            which are 0.
+            (4,), which are 0.
         """
         return (*super()._nominal(), [1.0, 1.0], [0.0] * 4)
 

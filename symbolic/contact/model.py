@@ -396,16 +396,14 @@ class ContactModel(ABC):
     @property
     def strength(self) -> float:
         """Holding force of the weakest hand [N]; 1 for pads. An advice divides the forces of
-        changed
-        cells by it, so that cells with weaker and stronger hands can be compared.
+        changed cells by it, so that cells with weaker and stronger hands can be compared.
         """
         return 1.0
 
     @property
     def own_changes(self) -> dict[str, Callable[[Contact], Contact]]:
         """Small changes of the contacts that an advice to the user may propose only with this
-        contact
-        model: functions from a pad to its changed copy, by the text of the advice.
+        contact model: functions from a pad to its changed copy, by the text of the advice.
         """
         return {}
 

@@ -122,12 +122,11 @@ def track_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
     """Build the function that moves an arm to the next sample of a box path.
 
     Inputs: state (3 n + 1,), which holds the joints (n,) at the previous sample, their first and
-    second difference between samples, and 1 if the arm did not reach an
-    earlier sample, else 0; pose (6 +
-    m,), the extended pose of the sample (box pose, then the cell's m redundant joints); wrench (6,)
-    on the box about the nominal contact point, world axes [N, N m]. Outputs: next_state, then
-    `TRACK_OUTPUTS`: joints, pose residual, lost (1 from the
-    first sample on that the arm does not reach), joint-limit margin, manipulability, joint torque.
+    second difference between samples, and 1 if the arm did not reach an earlier sample, else 0;
+    pose (6 + m,), the extended pose of the sample (box pose, then the cell's m redundant joints);
+    wrench (6,) on the box about the nominal contact point, world axes [N, N m]. Outputs:
+    next_state, then `TRACK_OUTPUTS`: joints, pose residual, lost (1 from the first sample on that
+    the arm does not reach), joint-limit margin, manipulability, joint torque.
 
     Args:
         robot, model, contact: the arm, its model, and its contact with the box.
@@ -293,9 +292,8 @@ def follow_function(
     Inputs: start (n,), joints at the first box pose [rad or m]; pose (6 + m, samples), the extended
     poses (box pose, then the cell's m redundant joints); wrench (6, samples) on the box about the
     nominal contact point, world axes [N, N m]. Outputs of all samples, one column per sample:
-    `TRACK_OUTPUTS`, which are joints, pose residual, lost (1 from the
-    first sample on that the arm does not reach), joint-limit margin, manipulability and
-    joint torque.
+    `TRACK_OUTPUTS`, which are joints, pose residual, lost (1 from the first sample on that the arm
+    does not reach), joint-limit margin, manipulability and joint torque.
 
     The second sample has no earlier motion to extrapolate, so Newton steps from the start posture
     predict its joints.
@@ -333,8 +331,7 @@ def start_function(robot: Robot, model: RobotModel, contact: Contact, name: str)
     extended pose (box pose, then the cell's m redundant joints). The redundant joints move evenly
     from their start positions to their values in the extended pose, in `BEGIN_STEPS` Newton steps
     that keep the flange at the box. Output: state (3 n + 1,): the joints after these steps, zeros
-    for their differences, and 0
-    because no sample was missed.
+    for their differences, and 0 because no sample was missed.
 
     Args:
         robot, model, contact: the arm, its model, and its contact with the box.

@@ -72,8 +72,7 @@ class StartBranch:
     @property
     def rank(self) -> tuple[float, ...]:
         """Sort key, smaller is better. It ranks by the number of samples of the hand-made
-        trajectory
-        that the arm can follow, then by clearance, then by margin times manipulability.
+        trajectory that the arm can follow, then by clearance, then by margin times manipulability.
 
         Clearance beyond `ROBUST_CLEARANCE` does not count. The margin is the distance to the
         nearest joint limit.
