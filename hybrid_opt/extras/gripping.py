@@ -68,21 +68,22 @@ class Grip:
 def propose_grip(
     cell: Cell, up: Range, along: Range, trials: int = TRIALS, *, progress: ShowProgress = False
 ) -> Grip:
-    """Find the place of both pads on their faces at which the cell's hand-made path has the least
-    product of duration and commanded force. The path with this place is proven free of collisions.
+    """Find the positions of both pads on their faces at which the cell's hand-made path has the
+    least product of duration and commanded force. The path with these positions is proven free of
+    collisions.
 
     Args:
         cell: cell with pads on upright faces, and forces in closed form.
         up: range of the shift of the pads upwards [m].
         along: range of the level shift along the faces [m]; positive is to the left of the first
             robot's pad, seen from the robot.
-        trials: number of places to try.
-        progress: True for a progress bar, or a function that is called with the number of places
-            tried and their total.
+        trials: number of pairs of positions to try.
+        progress: True for a progress bar, or a function that is called with the number of trials
+            done and their total.
 
     Raises:
         SettingsError: a range is reversed or begins below -1 m, the forces have no closed form, a
-            face is not upright, or the path cannot be driven with any place in the ranges.
+            face is not upright, or the path cannot be driven with any positions in the ranges.
     """
     for low, high in (up, along):
         if not -1.0 <= low <= high <= 1.0:

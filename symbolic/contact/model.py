@@ -413,7 +413,7 @@ class ContactModel(ABC):
         """Return the index of the force-controlled arm; None if neither arm controls a force.
 
         Args:
-            leader: index of the arm that keeps its place.
+            leader: index of the position-controlled arm.
         """
         return 1 - leader
 

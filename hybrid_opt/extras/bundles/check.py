@@ -103,7 +103,7 @@ class Finding:
 
     Attributes:
         held: (n,) True for samples at which both pads hold the box.
-        along, across: largest deviation of the second pad from its planned place relative to the
+        along, across: largest deviation of the second pad from its planned position relative to the
             first pad while they hold the box, along the first pad's normal and across it [m].
         use: largest value over its limit, by name of the limit; above 1 the limit is exceeded.
         collides: first pair that collides or cannot be proven free while the box is held; '' for
@@ -321,7 +321,7 @@ def check(
         trajectory: the trajectory.
         held: first and last time at which the pads hold the box [s]. None for the times that the
             file states; if it states none, the longest run of samples at which the pads are near
-            their planned places relative to each other.
+            their planned positions relative to each other.
         interpolation: the controller's interpolation between samples; None for one that uses all
             known derivatives, as ROS 2's joint trajectory controller does.
 
@@ -437,8 +437,8 @@ def _certificate(cell: Cell, joints: BPoly, time: Array) -> str:
 
 
 def _held(along: Array, across: Array) -> Mask:
-    """Find the longest run of samples at which both pads are near their planned places relative to
-    each other.
+    """Find the longest run of samples at which both pads are near their planned positions relative
+    to each other.
 
     Args:
         along: (n,) distance between the pads along the normal, minus the planned distance [m].
@@ -459,8 +459,8 @@ def _held(along: Array, across: Array) -> Mask:
 
 
 def _poses(workcell: Workcell, q: Array) -> Array:
-    """Compute the box poses (n, 6) [m, rad] if the first arm's pad keeps its place on the box. The
-    last three numbers are angles or a rotation vector, as in the cell's task.
+    """Compute the box poses (n, 6) [m, rad] if the first arm's pad keeps its position on the box.
+    The last three numbers are angles or a rotation vector, as in the cell's task.
 
     Args:
         workcell: the cell.

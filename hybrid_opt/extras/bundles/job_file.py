@@ -113,7 +113,7 @@ def chosen_step(
 
 
 def gap_of(sampled: SampledJob, interpolation: Interpolation, stiffness: float) -> Gap:
-    """Compute how far the pads deviate from their planned places between the samples of a job.
+    """Compute how far the pads deviate from their planned poses between the samples of a job.
 
     Args:
         sampled: the job at given time steps.
@@ -161,7 +161,7 @@ def between(time: Array, known: Sequence[Array], interpolation: Interpolation) -
 
 
 def pad_errors(workcell: Workcell, q: Array) -> tuple[Array, Array]:
-    """Compute how far the second pad is from its planned place relative to the first pad.
+    """Compute how far the second pad is from its planned position relative to the first pad.
 
     Args:
         workcell: the cell.
@@ -430,7 +430,7 @@ class Export:
 
     @cached_property
     def partner_stop(self) -> PartnerStop:
-        """Effect of an unplanned stop of one arm on the place of the pads.
+        """Effect of an unplanned stop of one arm on the distance of the pads.
 
         Raises:
             JobError: the pads would move farther apart than the cell allows.

@@ -46,7 +46,7 @@ class Stop:
 
 
 def stop_of(job: Job, model: TimingModel) -> Stop:
-    """Find the shortest stop along the path that the commanded forces allow at every place of a
+    """Find the shortest stop along the path that the commanded forces allow at every point of a
     job.
 
     Args:
@@ -70,7 +70,7 @@ def stop_of(job: Job, model: TimingModel) -> Stop:
     places, x = time[::STOP_STRIDE], np.linspace(0.0, 1.0, INSTANTS)
 
     def stop(duration: float) -> Stop:
-        """Simulate stops along the path that begin at many places of it. Return the largest normal
+        """Simulate stops along the path that begin at many points of it. Return the largest normal
         force and joint acceleration of all these stops, as shares of the commanded force and of the
         limit.
 
@@ -121,9 +121,10 @@ class PartnerStop:
     stop too.
 
     Attributes:
-        time: duration of a motion at the planned speed that is as long as the other arm's way until
-            it stands [s].
-        distance: largest displacement of the pads from their relative place that this causes [m].
+        time: duration of a motion at the planned speed that is as long as the other arm's motion
+            until it is at rest [s].
+        distance: largest displacement of the pads from their relative position that this causes
+            [m].
         survived: displacement up to which friction holds the box, at most `distance` [m]; None if
             the stiffness is unknown.
         allowed: largest displacement that the cell allows, `handling.partner_stop` [m]; None for

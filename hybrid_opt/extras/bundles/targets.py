@@ -313,7 +313,7 @@ def missing_for(name: str, workcell: Workcell, leader: int = 0) -> tuple[str, ..
     Args:
         name: name of the target.
         workcell: the cell.
-        leader: index of the arm that keeps its place.
+        leader: index of the position-controlled arm.
 
     Raises:
         SettingsError: the target is unknown.

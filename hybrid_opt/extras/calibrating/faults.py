@@ -267,7 +267,7 @@ def _range_faults(run: Recording) -> list[Fault]:
 
 
 def _pad_faults(workcell: Workcell, run: Recording, places: Places) -> list[Fault]:
-    """Return faults of pads that are not at their places on the box during holds, and of normal
+    """Return faults of pads that are not at their positions on the box during holds, and of normal
     forces that vanish; empty for none.
 
     Args:

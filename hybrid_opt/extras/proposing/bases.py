@@ -107,7 +107,7 @@ def base_choices(problem: Problem, spins: Array, rng: np.random.Generator) -> li
 def _scored(
     problem: Problem, spins: Array, rng: np.random.Generator
 ) -> list[tuple[float, dict[str, Any]]]:
-    """Propose bases for both robots, with the places of the pads on the box kept fixed.
+    """Propose bases for both robots, with the positions of the pads on the box kept fixed.
 
     Args:
         problem: the problem, with contacts.
@@ -176,7 +176,7 @@ def _sideways(problem: Problem, arm: int) -> tuple[Array, Array]:
         arm: index of the robot.
 
     Returns:
-        Mean (3,) of the contact's places at start and goal in the world [m]; and the horizontal
+        Mean (3,) of the contact's positions at start and goal in the world [m]; and the horizontal
         unit vector (3,) that points from the middle of the box's path to this mean.
     """
     point = np.append(np.array(problem.contacts[arm]["xyz"], dtype=float), 1.0)

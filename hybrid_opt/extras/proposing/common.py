@@ -88,7 +88,12 @@ class MachineKinematics:
         self.rest[still] = np.clip(0.0, self.lower[still], self.upper[still])
 
     def joints(self, x: Array, arm: int) -> Array:
-        """Return the joint positions (n, joints) of an arm in postures (n, size) [rad or m]."""
+        """Return the joint positions (n, joints) of an arm [rad or m].
+
+        Args:
+            x: (n, size) postures of the machine: common joints, then the other joints of each arm.
+            arm: index of the arm.
+        """
         q = np.empty((len(x), self.arms[arm].geometry.joints))
         q[:, self.arms[arm].common] = x[:, : self.common]
         q[:, self._own[arm]] = x[:, self._entries[arm]]
@@ -140,8 +145,18 @@ class MachineKinematics:
         return x, residual, determinant
 
     def _linearised(self, x: Array, targets: Sequence[Array]) -> tuple[Array, Array, Array, Array]:
-        """Compute Jacobians (n, 12, size) of both last joints' frames, pose errors (n, 12), and
-        what `solve` returns beside the postures."""
+        """Linearise the poses of both arms' last joints about n postures.
+
+        Args:
+            x: (n, size) postures [rad or m].
+            targets: for each arm (n, 4, 4) wanted poses of its last joint in the world.
+
+        Returns:
+            - Jacobians (n, 12, size) of both last joints' frames.
+            - Pose errors (n, 12): wanted minus actual poses.
+            - Residuals (n,) of the worse arm [m, rad].
+            - Determinants (2, n) of the Jacobian of each arm's joints that are not redundant [m^3].
+        """
         n = len(x)
         J, error = np.zeros((n, 12, len(self.rest))), np.empty((n, 12))
         residual, determinant = np.zeros(n), np.empty((2, n))
@@ -159,11 +174,12 @@ class MachineKinematics:
 def machine_holds(
     query: HoldQuery, arms: Sequence[ArmKinematics], rng: np.random.Generator
 ) -> tuple[HoldSearch, list[tuple[Hold, Hold]]]:
-    """Find pairs of holds of a machine's arms whose common joints stand where they suit both arms,
-    at the start and at the goal.
+    """Find pairs of holds of a machine's arms, one hold per arm, with equal positions of the joints
+    that move both arms. A hold is a pad rotation with a start and a goal posture.
 
-    Random postures reach for the box at the start. Those that are free follow it along the guides,
-    with all joints, to the goal; collisions on the way do not count.
+    Random postures are solved to hold the box at the start. Those without collisions follow the box
+    along several paths (guides) to the goal, with all joints; collisions between start and goal do
+    not count.
 
     Args:
         query: box poses at start and goal, and rotations of the pads to try.
@@ -209,7 +225,10 @@ class _MachineSearch:
         ]
 
     def round(self) -> None:
-        """Add the pairs of holds that one set of random postures leads to."""
+        """Draw random postures, move them from start to goal, and add a pair of holds for each
+        posture that arrives without collision. A hold is a pad rotation with a start and a goal
+        posture.
+        """
         machine, query = self.machine, self.query
         which = [self.rng.integers(0, len(spins), MACHINE_STARTS) for spins in self._spins]
         x = machine.drawn(MACHINE_STARTS, self.rng)
@@ -227,10 +246,16 @@ class _MachineSearch:
             x, which = x[~arrived], [part[~arrived] for part in which]
 
     def _lead(self, x: Array, which: Sequence[NDArray[np.intp]], guide: Array) -> NDArray[np.bool_]:
-        """Follow a guide (m, 6) from postures x (n, size), and add those that arrive.
+        """Follow box poses from the start to the goal, and add a pair of holds for each posture
+        that arrives without collision.
+
+        Args:
+            x: (n, size) postures of the machine at the start [rad or m].
+            which: for each arm the index (n,) of its pad's rotation in each posture.
+            guide: (m, 6) box poses from start to goal [m, rad].
 
         Returns:
-            (n,) True for postures that arrive at the goal.
+            (n,) True for postures that reach the goal, with or without collision.
         """
         machine = self.machine
         path, measure = np.tile(x, (len(guide), 1, 1)), np.zeros((2, len(guide), len(x)))
@@ -261,8 +286,15 @@ class _MachineSearch:
     def _holds(
         self, path: Array, measure: Array, which: Sequence[NDArray[np.intp]], row: int
     ) -> tuple[Hold, Hold]:
-        """Build the holds of both arms at the ends of a path (m, size) of the machine, along which
-        each arm has the manipulability `measure` (2, m) [m^3]."""
+        """Build the hold of each arm, a pad rotation with a start and a goal posture, from a path
+        of the machine.
+
+        Args:
+            path: (m, size) postures of the machine from start to goal [rad or m].
+            measure: (2, m) manipulability of each arm along the path [m^3].
+            which: for each arm the index of its pad's rotation, for all paths.
+            row: index of this path in `which`.
+        """
         found = []
         for k, arm in enumerate(self.machine.arms):
             q, spin = self.machine.joints(path, k), float(self._spins[k][which[k][row]])
@@ -272,21 +304,36 @@ class _MachineSearch:
         return found[0], found[1]
 
     def _targets(self, pose: Array, which: Sequence[NDArray[np.intp]]) -> list[Array]:
-        """Compute the poses (n, 4, 4) of both arms' last joints at a pose (6,) of the box, for the
-        indices `which` of their pads' rotations."""
+        """Compute the poses (n, 4, 4) in the world that both arms' last joints need at a box pose.
+
+        Args:
+            pose: (6,) box pose [m, rad].
+            which: for each arm the indices (n,) of its pad's rotations.
+        """
         T_world_box = box_placement(self._orientation, pose)
         return [T_world_box @ held[part] for held, part in zip(self._held, which, strict=True)]
 
     def _regular(self, measure: Array) -> NDArray[np.bool_]:
-        """Return (n,) True where the manipulability (2, n) of both arms suffices [m^3]."""
+        """Return (n,) True where the manipulability `measure` (2, n) [m^3] of both arms is at least
+        its lower limit.
+        """
         least = np.array([[arm.least] for arm in self.machine.arms])
         return np.asarray(np.all(measure >= least, axis=0))
 
     def _blocked(
         self, pose: Array, x: Array, which: Sequence[NDArray[np.intp]]
     ) -> NDArray[np.bool_]:
-        """Return (n,) True for postures in which the machine collides while it holds the box at a
-        pose (6,), or that take too much torque; count collisions by pair of bodies."""
+        """Find postures in which the machine collides while it holds the box, or that take too much
+        of a joint's torque; count collisions by pair of bodies.
+
+        Args:
+            pose: (6,) box pose [m, rad].
+            x: (n, size) postures of the machine [rad or m].
+            which: for each arm the index (n,) of its pad's rotation in each posture.
+
+        Returns:
+            (n,) True for these postures.
+        """
         judge, poses = self.query.judge, np.tile(pose, (len(x), 1))
         if judge is None or not len(x):
             return np.zeros(len(x), dtype=bool)

@@ -82,7 +82,7 @@ def changes(problem: Problem, found: Draft) -> dict[str, Any]:
 
     Returns:
         New keys and values by name of the table: of `task`, `robots` and `contacts`, of `handling`
-        if a stand-off is proposed, and those chosen before.
+        if a stand-off is proposed, and those that the search chose earlier, such as bases.
     """
     poses = readable_turns(found.waypoints[:, :POSE_SIZE], found.workcell.task.orientation)
     waypoints = np.hstack([poses, found.waypoints[:, POSE_SIZE:]])

@@ -47,15 +47,15 @@ Entry = dict[str, Any]
 
 
 def pattern_entry(entry: Entry, thickness: float) -> Entry:
-    """Complete the table of a contact in a file by places and normals of its hands.
+    """Complete the table of a contact in a file by positions and normals of its hands.
 
     They are stated in the frame of the first hand, whose z axis points into the payload.
 
     Args:
         entry: table of the contact in the problem file, without `xyz`. The `xyz` of the hands in
             `further` are already relative to the first hand.
-        thickness: thickness of the payload [m]. It places the opposite finger of a gripper that has
-            no `further`.
+        thickness: thickness of the payload [m]. It decides where the opposite finger of a gripper
+            is, if the table has no `further`.
     """
     further = entry.get("further", [])
     if entry.get("kind") == "fingers" and not further:
@@ -67,8 +67,8 @@ def pattern_entry(entry: Entry, thickness: float) -> Entry:
 
 
 def place_entry(contact: Contact, with_normals: bool = False) -> Entry:
-    """Return the keys of a contact's table in a file that place its hands or pads on the box:
-    `xyz`, `spin` and `further`.
+    """Return the keys of a contact's table in a file that state where its hands or pads are on the
+    box: `xyz`, `spin` and `further`.
 
     Args:
         contact: the contact.
@@ -91,10 +91,10 @@ def hand_places(
     along: Array,
     workcell: Callable[[list[Entry]], Workcell],
 ) -> list[list[Entry]]:
-    """Propose places of both arms' hands on a box.
+    """Propose positions of both arms' hands on a box.
 
-    Places at which the box at rest needs a small share of the hands' holding force come first.
-    Places at which the arms would cross are left out.
+    Positions with which the box at rest needs a small share of the hands' holding force come first.
+    Positions with which the arms would cross are left out.
 
     Args:
         patterns: contact of each arm, with its hands placed relative to the first one as by
@@ -131,7 +131,7 @@ def _with_tools_outside(cell: Workcell, pairs: Sequence[Both]) -> Iterator[Both]
     Args:
         cell: cell with the robots, tools and payload. Its own contacts serve only to find the pose
             of each pad in the frame of its arm's last joint.
-        pairs: contacts of both arms, one pair per tried place.
+        pairs: contacts of both arms, one pair per proposal.
     """
     bodies, arms = collision_bodies(cell), [arm_geometry(cell, arm) for arm in (0, 1)]
     T_joint_pad = [
@@ -191,8 +191,8 @@ def _placed(
         outward: (3,) outward normal of the face in the box frame, along one of its axes.
         size: (3,) edges of the box [m].
         turn: rotation of the hands about the normal of the face [rad].
-        place: (2,) place of the hands on the face, along the face's two axes: 0 is its middle, -1
-            and 1 are its edges.
+        place: (2,) position of the hands on the face, along the face's two axes: 0 is its middle,
+            -1 and 1 are its edges.
     """
     face = pad_rotation(-outward, 0.0)
     rotation = face @ pose_matrix(np.zeros(3), np.array([0.0, 0.0, turn]))[:3, :3]

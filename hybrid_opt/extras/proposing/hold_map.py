@@ -55,12 +55,12 @@ allow, and random ones."""
 
 @dataclass(frozen=True)
 class HoldMapSettings:
-    """Grid of a map of places where both arms can hold the box.
+    """Grid of a map of box poses that both arms can hold.
 
     Attributes:
-        step: distance between places on a level [m]; None to choose one of `PLACE_STEPS`.
+        step: distance between positions at one height [m]; None to choose one of `PLACE_STEPS`.
         heights: heights of the box centre in the world [m]; empty to choose `CHOSEN_HEIGHTS` from
-            the lowest to the highest at which something holds.
+            the lowest to the highest at which both arms can hold the box.
         yaws: number of directions of the box, evenly over half a turn about the vertical; over a
             whole turn for hands, and if the file states where the pads are.
     """
@@ -100,8 +100,8 @@ class HeldPlace:
 
 @dataclass(frozen=True, eq=False)
 class HoldMap:
-    """Where both arms can hold the box at once, on a grid of heights (l), places (y and x) and
-    directions (w) of the box.
+    """Map of the box poses that both arms can hold at once, on a grid of heights (l), positions (y
+    and x) and directions (w) of the box.
 
     Attributes:
         geometry: bodies of the cell.
@@ -110,12 +110,14 @@ class HoldMap:
         yaws: (w,) rotations about the vertical, in addition to the orientation of the file [rad].
         poses: (l, ny, nx, w, 6) box poses [m, rad].
         state: (l, ny, nx, w) values of `PoseState`.
-        way: (l, ny, nx, w) index of the way that holds; -1 where none does.
+        way: (l, ny, nx, w) index in `ways` of the way to hold the box; -1 where none is possible.
         spins: (l, ny, nx, w, 2) rotation of each pad about its normal, in addition to the file's
-            [rad]; NaN where nothing holds.
-        q: joint positions (l, ny, nx, w, joints) of each arm [rad or m]; NaN where nothing holds.
+            [rad]; NaN where the box cannot be held.
+        q: joint positions (l, ny, nx, w, joints) of each arm [rad or m]; NaN where the box cannot
+            be
+        held.
         comfort: (l, ny, nx, w) of the less comfortable arm, from 0, at a joint limit and a singular
-            posture, to 1, far from both; NaN where nothing holds.
+            posture, to 1, far from both; NaN where the box cannot be held.
     """
 
     geometry: CellGeometry
@@ -133,7 +135,9 @@ class HoldMap:
 
     @property
     def step(self) -> float:
-        """Distance between places on a level [m]; 0 for a single place."""
+        """Distance between neighbouring positions of the box centre at one height [m]; 0 for a
+        single position.
+        """
         across = np.diff(self.x if len(self.x) > 1 else self.y)
         return float(across[0]) if len(across) else 0.0
 
@@ -144,13 +148,17 @@ class HoldMap:
 
     @property
     def directions(self) -> NDArray[np.intp]:
-        """(l, ny, nx) number of directions of the box that hold at each place."""
+        """(l, ny, nx) number of directions of the box in which both arms can hold it, at each
+        position.
+        """
         return np.asarray(self.holds.sum(axis=-1))
 
     @cached_property
     def _quality(self) -> Array:
-        """(l, ny, nx, w) comfort times the distance, in steps, from the nearest place on the level
-        that does not hold in the same direction; 0 where nothing holds."""
+        """(l, ny, nx, w) comfort of the postures, times the distance in grid steps to the nearest
+        position at the same height at which the box cannot be held in the same direction; 0 at
+        poses that cannot be held.
+        """
         inside = np.pad(self.holds, ((0, 0), (1, 1), (1, 1), (0, 0)))
         depth = np.zeros(inside.shape)
         for level, yaw in product(range(len(self.z)), range(len(self.yaws))):
@@ -158,8 +166,10 @@ class HoldMap:
         return np.asarray(depth[:, 1:-1, 1:-1] * np.where(self.holds, self.comfort + 1e-6, 0.0))
 
     def best(self, level: int | None = None) -> HeldPlace | None:
-        """Return the place that lies farthest within those that hold in its direction, weighted by
-        the comfort of its postures; None if nothing holds.
+        """Return the best box pose that both arms can hold; None if there is none.
+
+        It maximises the comfort of the postures times the distance to the nearest position at which
+        the box cannot be held in the same direction.
 
         Args:
             level: index of the height; None for all heights.
@@ -187,10 +197,10 @@ def hold_map(
     settings: HoldMapSettings | None = None,
     tell: Callable[[int, int], None] = lambda done, total: None,
 ) -> HoldMap:
-    """Find where both arms can hold the box at once.
+    """Find the poses at which both arms can hold the box at once.
 
-    A box pose holds if both arms reach their contacts in one of the ways of `ways_to_hold`, within
-    their joint limits and with the manipulability that `propose` requires, and FCL finds no
+    A pose can be held if both arms reach their contacts in one of the ways of `ways_to_hold`,
+    within their joint limits and with the manipulability that `propose` requires, and FCL finds no
     collision.
 
     Args:
@@ -233,8 +243,12 @@ def hold_map(
 
 
 def holds_anywhere(problem: Problem, spins: Array, rng: np.random.Generator) -> bool:
-    """Return True if both arms can hold the box somewhere on a coarse grid of all places within
-    their lengths; arguments and errors as of `hold_map`."""
+    """Return True if both arms can hold the box at some pose of a coarse grid, which covers all
+    positions within the arms' lengths.
+
+    Args:
+        problem, spins, rng: as for `hold_map`, whose errors are raised too.
+    """
     grids = _GridSearch(problem, spins, rng, HoldMapSettings())
     return bool((grids.searched(*grids.coarse_grid()).state == PoseState.HOLDS).any())
 
@@ -274,7 +288,11 @@ class _GridSearch:
         settings: HoldMapSettings,
         tell: Callable[[int, int], None] = lambda done, total: None,
     ) -> None:
-        """Prepare the ways to hold the box and the postures; arguments as of `hold_map`."""
+        """Prepare the ways to hold the box and the postures.
+
+        Args:
+            problem, spins, rng, settings, tell: as for `hold_map`.
+        """
         self.ways = list(ways_to_hold(problem, spins))
         if not self.ways:
             text = "the robots' tools enter the payload in every way to hold it"
@@ -309,7 +327,7 @@ class _GridSearch:
         return search
 
     def coarse_grid(self) -> Grid:
-        """Return a coarse grid of all places within the lengths of both arms."""
+        """Return a coarse grid of all positions within the lengths of both arms."""
         lows, highs = [], []
         for way in self.ways:
             spheres = [(at, length + np.linalg.norm(point)) for at, length, point in way.bounds]
@@ -322,8 +340,10 @@ class _GridSearch:
         return x, y, z
 
     def fine_grid(self) -> Grid:
-        """Choose a finer grid of round numbers about the places of the coarse one that hold; about
-        those that both arms reach, or about all, if there are none."""
+        """Choose a finer grid of round numbers about those positions of the coarse grid at which
+        the box can be held. If there are none, the grid is about the positions that both arms
+        reach, or else about all positions.
+        """
         coarse = self.coarse_grid()
         state = self.searched(*coarse).state.reshape(*COARSE_GRID[::-1], -1)
         wanted = state == PoseState.HOLDS
@@ -346,8 +366,9 @@ class _GridSearch:
 
 
 def _multiples(low: float, high: float, step: float) -> Array:
-    """Return the multiples of a step from `low` to `high`; the one next to their middle if there
-    are none."""
+    """Return the multiples of a step from `low` to `high`; the multiple nearest to the middle of
+    this range if it contains none.
+    """
     first, last = np.ceil(low / step - 1e-9), np.floor(high / step + 1e-9)
     numbers = np.arange(first, last + 1.0)
     return np.round(step * (numbers if len(numbers) else np.round([(low + high) / step / 2])), 9)

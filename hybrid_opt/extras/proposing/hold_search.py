@@ -120,8 +120,15 @@ class WayToHold:
         return found
 
     def within_lengths(self, T_world_box: Array) -> NDArray[np.bool_]:
-        """Return (n,) True for the box poses (n, 4, 4) at which neither contact is farther from its
-        arm's first joint than the arm is long."""
+        """Find box poses at which neither contact is farther from its arm's first joint than the
+        arm is long.
+
+        Args:
+            T_world_box: (n, 4, 4) box poses.
+
+        Returns:
+            (n,) True for these poses.
+        """
         near = np.ones(len(T_world_box), dtype=bool)
         for shoulder, length, point in self.bounds:
             contact = transform(np.eye(3), point)
@@ -179,13 +186,14 @@ class PostureLibrary:
         self._tree = KDTree(_features(self.T_world_pad)) if fine.any() else None
 
     def nearest(self, T_world_pad: Array) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Find postures whose pads are nearest to wanted places, whatever their spin.
+        """Find stored postures whose pad poses are near wanted ones. Rotations of the pad about its
+        normal do not count.
 
         Args:
             T_world_pad: (n, 4, 4) wanted poses of the pad.
 
         Returns:
-            Index of a wanted pose (m,), and index of a posture near it (m,).
+            m pairs: index (m,) of a wanted pose, and index (m,) of a posture near it.
         """
         if self._tree is None or not len(T_world_pad):
             return np.zeros(0, dtype=np.intp), np.zeros(0, dtype=np.intp)
@@ -197,7 +205,10 @@ class PostureLibrary:
 
 
 def _features(T_world_pad: Array) -> Array:
-    """Compute coordinates (n, 6) [m] of pad poses (n, 4, 4), whose distances are compared."""
+    """Compute coordinates (n, 6) [m] of pad poses T_world_pad (n, 4, 4): position, and normal times
+    a lever. The Euclidean distance of two such vectors measures how different the poses are, except
+    for the rotation about the normal.
+    """
     return np.hstack([T_world_pad[:, :3, 3], NORMAL_LEVER * T_world_pad[:, :3, 2]])
 
 
@@ -295,7 +306,7 @@ class PoseSearch:
     def attempt(
         self, number: int, libraries: Sequence[PostureLibrary], rows: NDArray[np.intp]
     ) -> None:
-        """Try one way to hold the box at those of some poses where none holds yet.
+        """Try one way to hold the box at those of some poses for which no way has been found yet.
 
         Args:
             number: index of the way.

@@ -108,7 +108,7 @@ class ArmKinematics:
 
     def moved(self, T_world_root: Array) -> ArmKinematics:
         """Return the same arm with its root, the frame in which the first joint is fixed, at
-        another place.
+        another pose.
 
         Args:
             T_world_root: (4, 4) pose of the root in the world.

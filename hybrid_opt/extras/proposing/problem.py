@@ -92,12 +92,12 @@ class Problem:
 
     @cached_property
     def contacts(self) -> list[dict[str, Any]]:
-        """The two tables of contacts as they stand in a file, with the places of pads or hands on
-        the box.
+        """The two tables of contacts as they stand in a file, with the positions of pads or hands
+        on the box.
 
-        Places in the file are kept. Otherwise hands that grip by themselves are placed at the first
-        of `hand_places`, and pads at the centres of the two opposite faces that face the robots'
-        bases or a machine's shoulders. Without bases in the file, pads are placed on the faces
+        Positions in the file are kept. Otherwise hands that grip by themselves are at the first
+        proposal of `hand_places`, and pads at the centres of the two opposite faces that face the
+        robots' bases or a machine's shoulders. Without bases in the file, pads are on the faces
         beside the direction of the carry.
 
         Raises:
@@ -182,7 +182,7 @@ class Problem:
 
         Returns:
             For each placement the two tables of contacts as they stand in a file; an empty list if
-            the file states the places or has no bases.
+            the file states the positions or has no bases.
         """
         if self._bases is None or self.states_contacts:
             return []
@@ -216,11 +216,11 @@ class Problem:
         """Return copies of the problem whose pads or hands are placed on different sides of the
         box.
 
-        Hands are placed at the best of `hand_places`, one copy for each. For pads there is one copy
-        for each pair of opposite upright faces; for a machine with two arms also one with exchanged
-        arms. Only the problem itself is returned if the file states the places, or if two separate
-        robots move the box so far horizontally that the direction of the carry determines the
-        faces.
+        Hands are at the best proposals of `hand_places`, one copy for each. For pads there is one
+        copy for each pair of opposite upright faces; for a machine with two arms also one with
+        exchanged arms. Only the problem itself is returned if the file states the positions, or if
+        two separate robots move the box so far horizontally that the direction of the carry
+        determines the faces.
         """
         entries = self.data["contacts"]
         start, goal = self.poses

@@ -126,7 +126,7 @@ def least_changes(
     """Find the smallest change of each kind with which both arms can hold the box.
 
     Args:
-        problem: problem whose file states the bases and the pads' places.
+        problem: problem whose file states the bases and the pads' positions.
         can_hold: function that returns True for a problem in which both arms can hold the box.
         is_over: function that returns True if the search has to end.
         kinds: kinds of changes that are tried.

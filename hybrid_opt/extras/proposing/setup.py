@@ -84,13 +84,13 @@ def ranked_pairs(
     holds: Iterable[tuple[Hold, Hold]],
     ends: tuple[Array, Array],
 ) -> list[Pair]:
-    """Select pairs of holds in which the arms do not collide at start and goal, the most promising
-    first.
+    """Select pairs of holds, one hold per arm, in which the arms do not collide at start and goal,
+    the most promising first. A hold is a pad rotation with a start and a goal posture.
 
     Args:
         workcell: the cell, with chosen redundant joints.
         judge: checker of collisions, without a margin.
-        holds: pairs of holds; joints that move both arms have the same positions in both.
+        holds: pairs of holds; in each pair, joints that move both arms have equal positions.
         ends: start and goal pose (6,) of the box [m, rad].
     """
     scored = [(a.score + b.score, (a, b)) for a, b in holds]
@@ -201,7 +201,8 @@ def prepare(
     rng: np.random.Generator,
     tell: Callable[[str], None] = lambda text: None,
 ) -> Setup:
-    """Find all holds of both arms, and the pairs of holds in which the arms do not collide.
+    """Find all holds of both arms, and the pairs of holds in which the arms do not collide. A hold
+    is a pad rotation with a start and a goal posture.
 
     Args:
         problem: the problem.
@@ -244,7 +245,8 @@ def prepare(
 
 
 def _progress(searches: Sequence[HoldSearch]) -> tuple[float, ...]:
-    """Rank results of the search for holds by the less successful arm.
+    """Rank results of the search for holds (pad rotations with start and goal posture) by the less
+    successful arm.
 
     Args:
         searches: result for each arm, or for both on common joints.
@@ -374,7 +376,9 @@ def reach_missing(workcell: Workcell, ends: tuple[Array, Array], spins: Array) -
 
 
 def _arm_missing(kinematics: ArmKinematics, search: HoldSearch, name: str) -> str:
-    """Return a text on why the arm, or the whole machine called `name`, has no hold."""
+    """Return a text on why the arm, or the whole machine called `name`, cannot hold the box from
+    start to goal.
+    """
     if not search.within:
         names = list(arm_model(kinematics.workcell.robots[kinematics.arm]).names)[1:]
         joints = ", ".join(names[joint] for joint, _ in search.joints.most_common(TOLD))
@@ -399,8 +403,8 @@ def _arm_missing(kinematics: ArmKinematics, search: HoldSearch, name: str) -> st
 
 
 def _no_pair(query: HoldQuery, judge: PoseJudge, searches: Sequence[HoldSearch]) -> str:
-    """Return a text on why no pair of holds was found: an arm that cannot hold the box, or bodies
-    that collide although either arm alone is free.
+    """Return a text on why both arms cannot hold the box together: an arm cannot hold it alone, or
+    bodies collide only with both arms.
 
     Args:
         query: box poses that the arms have to hold.
@@ -432,7 +436,8 @@ def no_path(pairs: Iterable[Pair], refusals: Sequence[str]) -> str:
     evaluator's reasons to refuse paths.
 
     Args:
-        pairs: pairs of holds with which paths were searched.
+        pairs: pairs of holds (pad rotations with start and goal posture of both arms) with which
+            paths were searched.
         refusals: reasons of the evaluator.
     """
     met: Counter[tuple[str, str]] = Counter()

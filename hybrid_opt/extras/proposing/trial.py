@@ -83,7 +83,7 @@ class PayloadSceneChecker:
 
         Args:
             begin, end: (6,) box poses at the ends [m, rad].
-            shares: (n,) places on the motion that are checked: 0 is its beginning, 1 its end.
+            shares: (n,) points of the motion that are checked: 0 is its beginning, 1 its end.
         """
         key = begin.tobytes(), end.tobytes()
         if key not in self._met:

@@ -85,13 +85,13 @@ def along(corners: Sequence[ChainConfiguration]) -> Array:
 def remove_corners(
     chain: ClosedChain, corners: Sequence[ChainConfiguration], rng: np.random.Generator
 ) -> list[ChainConfiguration]:
-    """Shorten a path: replace parts of it by straight collision-free motions between random places
-    on it.
+    """Shorten a path: replace parts of it by straight collision-free motions between random points
+    of it.
 
     Args:
         chain: both arms, whose pads stay fixed on the box.
         corners: corners of a collision-free path.
-        rng: generator that chooses the places.
+        rng: generator that chooses the points.
 
     Returns:
         Configurations along the path, at most `planner.PATH_STEP` apart.

@@ -480,7 +480,7 @@ def simulate_carry(
         carry: carry from rest to rest.
         witness: simulation of the cell.
         control: kind of force control, as in `CellSimulation.simulate`.
-        leader: index of the arm that keeps its place; the other one is force-controlled.
+        leader: index of the position-controlled arm; the other one is force-controlled.
 
     Raises:
         SettingsError: the carry does not start and end at rest.

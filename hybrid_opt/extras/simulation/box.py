@@ -222,7 +222,7 @@ class CarriageMotion:
         [m/s^2].
 
         Args:
-            place: (3,) the point in the box frame [m].
+            place: (3,) position of the point in the box frame [m].
         """
         spin, spin_rate = self.velocity[:, 3:], self.acceleration[:, 3:]
         linear = np.einsum("nji,nj->ni", self.rotation, self.acceleration[:, :3])
@@ -305,7 +305,7 @@ def drive_of(
         settings: settings of the simulation.
         press: (n,) pressing force at the samples [N]; None for the planned normal force of the arm
             that does not lead.
-        leader: index of the arm whose pad keeps its place.
+        leader: index of the arm whose pad is fixed to the carriage.
         moments: moments from `planned_moments` that rotate the pads about their centres; None for
             none.
 

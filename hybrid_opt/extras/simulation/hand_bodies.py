@@ -168,14 +168,17 @@ class HandSprings:
       </body>"""
 
     def own_forces(self, motion: CarriageMotion) -> dict[str, Array]:
-        """Compute the joint forces (n,) [N, N m] that accelerate the inertia of the hands, by the
-        name of the joint.
+        """Compute the forces at the hands' joints that accelerate the hands' own inertia, so that
+        this inertia does not load the springs.
 
-        The inertia of an arm displaces it by its acceleration over the square of `HAND_FREQUENCY`,
-        both arms alike, which loads no hand.
+        The inertia of the arms needs no such forces: it displaces both arms equally, which loads no
+        hand.
 
         Args:
-            motion: motion at n time steps of the carriage, the body that bears all.
+            motion: motion at n time steps of the carriage, the body that bears all hands.
+
+        Returns:
+            Forces (n,) [N, N m] by name of the joint.
         """
         found = dict[str, Array]()
         for k, hand in enumerate(self.workcell.pads):

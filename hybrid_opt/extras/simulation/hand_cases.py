@@ -83,7 +83,8 @@ class HandCase:
 
         Args:
             motion: motion of the carriage.
-            holding: (2,) holding force of each robot's hands, of which `left` acts [N].
+            holding: (2,) nominal holding force of each robot's hands [N]. The share `left` of it
+                acts.
             factor: number by which the holding forces are multiplied.
             settings: settings of the simulation.
         """
@@ -113,8 +114,10 @@ def random_hand_cases(workcell: Workcell, n: int, rng: np.random.Generator) -> l
 
 def worst_hand_case(carry: Carry, model: RobustModel) -> HandCase:
     """Return the case of a cell's uncertainty in which its contact model needs the largest holding
-    force along a carry. The arms work against each other in the direction that requires most of a
-    hand where this force is needed.
+    force along a carry.
+
+    At the sample that needs it, the arms push against each other in the direction that raises the
+    needed force of a hand most.
 
     Args:
         carry: the carry.

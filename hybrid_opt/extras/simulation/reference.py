@@ -89,7 +89,7 @@ class Reference:
         press_torque: (n, all joints) joint torques per newton of the arm's normal force [m, for
             sliding joints 1].
         job: start, goal and support of the box.
-        leader: index of the arm that keeps its place if only the other arm controls its force.
+        leader: index of the position-controlled arm if only the other arm controls its force.
     """
 
     workcell: Workcell
@@ -153,7 +153,7 @@ def carry_reference(
         carry: the carry at n samples.
         press: (n,) commanded normal force of the arm that does not lead [N]; None for its planned
             force.
-        leader: index of the arm that keeps its place. Its normal force rises above the planned one
+        leader: index of the position-controlled arm. Its normal force rises above the planned one
             by as much as `press` exceeds the other arm's planned force.
 
     Raises:
@@ -413,7 +413,7 @@ def pressed_reference(cell: Cell, carry: Carry, leader: int = 0) -> tuple[Refere
     Args:
         cell: the cell.
         carry: carry from rest to rest.
-        leader: index of the arm that keeps its place; the other one is force-controlled.
+        leader: index of the position-controlled arm; the other one is force-controlled.
 
     Returns:
         The commands, and how the forces were chosen.

@@ -136,7 +136,7 @@ class Look:
 
     Attributes:
         time: time of the measurement [s].
-        s: commanded place on the path, as its planned time [s].
+        s: commanded point on the path, as its planned time [s].
         direction: rate of the planned time, 1 forward or -1 back.
         age: time since each arm's posture was measured [s].
         q: joint positions of each arm [rad or m].
@@ -172,7 +172,7 @@ class Looks:
 
         Args:
             now: time of the measurement [s].
-            machine: state machine of the job, with the commanded place on the path.
+            machine: state machine of the job, with the commanded point on the path.
             seen: measured state of the arms.
             raw: reading of each arm's force sensor [N]; None without a sensor.
             way: distance of the pressing pad beyond its planned position [m]; NaN if unknown.
@@ -215,7 +215,7 @@ class Looks:
         return max(found) / max(planned)
 
     def late(self, job: Job, arm: int) -> float:
-        """Return the median delay of an arm's measured posture behind the commanded place on the
+        """Return the median delay of an arm's measured posture behind the commanded point on the
         path [s]; NaN without measurements.
 
         Args:

@@ -86,7 +86,7 @@ class Switch:
 
 
 class Job:
-    """A job read from its file. A place on its path is given by its planned time s [s].
+    """A job read from its file. A point on its path is given by its planned time s [s].
 
     Attributes:
         document: content of the file as JSON values.
@@ -167,8 +167,8 @@ class Job:
         """Return True if the box may already stand on its support although the set-down is not
         finished.
 
-        This is so if s is in the set-down, if the planned place of the box is at most `TOUCH` from
-        its place at the end of the set-down, and if `stand` has not been called.
+        This is so if s is in the set-down, if the planned position of the box is at most `TOUCH`
+        from its position at the end of the set-down, and if `stand` has not been called.
 
         Args:
             s: planned time [s].
@@ -181,7 +181,7 @@ class Job:
         return math.dist(last, list(here)[:3]) <= TOUCH
 
     def stand(self, s: float, q: Sequence[Sequence[float] | None]) -> None:
-        """Let the release begin at a place within the set-down, because the box stands already.
+        """Let the release begin at a point within the set-down, because the box stands already.
 
         From the release on, planned positions are shifted by the part of the set-down that is left
         out. While the commanded forces decrease, the positions move to the measured ones: the box
@@ -215,10 +215,10 @@ class Job:
         return self._phases[0][0] < s <= self.pressed
 
     def grips(self, s: float, direction: float) -> bool:
-        """Return True if hands are to be switched on at a place of the path.
+        """Return True if hands are to be switched on at a point of the path.
 
         Args:
-            s: planned time of the place [s].
+            s: planned time of the point [s].
             direction: 1 if the job runs forward, -1 if it runs back.
         """
         passed = [
@@ -307,12 +307,12 @@ class Job:
         return [b + (a - b) * rate * rate for a, b in zip(moving, holding, strict=True)]
 
     def distance(self, arm: int, q: Sequence[float], s: float) -> float:
-        """Return an upper bound of the distance between an arm's pad and its planned place [m].
+        """Return an upper bound of the distance between an arm's pad and its planned position [m].
 
         Args:
             arm: index of the arm.
             q: joint positions of the arm [rad or m].
-            s: planned time of that place [s].
+            s: planned time of that position [s].
         """
         reach = self.robots[arm]["reach"]
         planned = self.position(arm, s)
@@ -363,7 +363,7 @@ class Job:
             q: measured joint positions [rad or m].
             s: planned time around which to search [s].
             window: range of the search, as the least and the largest value of result minus `s` [s].
-            near: distance [m]. If the pad is at most this far from its planned place at `s`, the
+            near: distance [m]. If the pad is at most this far from its planned position at `s`, the
                 result is `s` itself.
         """
         if self.distance(arm, q, s) <= near:

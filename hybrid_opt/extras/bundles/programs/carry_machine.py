@@ -45,7 +45,7 @@ class Moment:
 
     Attributes:
         time: time from now [s].
-        s: planned time of the place on the path [s].
+        s: planned time of the point on the path [s].
         rate: derivative of s with respect to time.
         change: derivative of the rate with respect to time [1/s].
     """
@@ -57,10 +57,10 @@ class Moment:
 
 
 class Clock:
-    """The commanded place on the path of a job, given by its planned time s, and how fast it moves.
+    """The commanded point on the path of a job, given by its planned time s, and how fast it moves.
 
     Attributes:
-        s: planned time of the place of both arms [s].
+        s: planned time of the point on the path [s].
         rate: derivative of s with respect to time: 1 at the planned speed, 0 at rest, -1 backwards.
     """
 
@@ -79,7 +79,7 @@ class Clock:
         self._from, self._to, self._since = rate, rate, 0.0
 
     def keep(self, low: float, high: float) -> None:
-        """Limit the planned time of the commanded place to a range.
+        """Limit the planned time of the commanded point to a range.
 
         Args:
             low, high: ends of the range [s].
@@ -107,7 +107,7 @@ class Clock:
             self._takes = self._stop_time if takes is None else takes
 
     def advance(self, dt: float) -> None:
-        """Move the commanded place on for a time step. Dividing the step into several calls changes
+        """Move the commanded point on for a time step. Dividing the step into several calls changes
         nothing.
 
         Args:
@@ -144,7 +144,7 @@ class Clock:
 
     def ahead(self, rate: float, step: float) -> Iterator[Moment]:
         """Yield the states from now on if the rate changes to a given one, until the commanded
-        place moves no more.
+        point moves no more.
 
         Args:
             rate: rate after the change.
@@ -192,7 +192,7 @@ class Machine:
     Attributes:
         state: the present state.
         reason: reason of the last stop.
-        clock: commanded place on the path.
+        clock: commanded point on the path.
         stop_time: duration of the present stop, or of the last one [s].
         opened: True if the last check found all hands as commanded, so that a waiting clock may
             continue.
@@ -295,12 +295,12 @@ class Machine:
 
     @property
     def grip(self) -> bool:
-        """True if hands have to be switched on at the present place of a begun job."""
+        """True if hands have to be switched on at the present point of a begun job."""
         return self.job.grips(self.clock.s, self._direction)
 
     def _aim(self, direction: float) -> None:
-        """List the places ahead at which the clock has to wait until inputs report the state of
-        hands, and limit the clock to the first.
+        """List the points of the path ahead at which the clock has to wait until inputs report the
+        state of hands, and limit the clock to the first.
 
         Args:
             direction: 1 forward, -1 back.
@@ -313,7 +313,9 @@ class Machine:
         self._next_gate()
 
     def _next_gate(self) -> None:
-        """Let the clock run to the next place at which it has to wait for a switch of hands."""
+        """Let the clock run to the next point of the path at which it has to wait for a switch of
+        hands.
+        """
         self._waited = 0.0
         low, high = 0.0, self.job.end
         if self._gates and self._direction > 0.0:
@@ -323,8 +325,8 @@ class Machine:
         self.clock.keep(low, high)
 
     def _wait(self, dt: float, seen: Seen) -> None:
-        """Wait while the clock stands at a place where hands are switched, and continue when all
-        inputs report the commanded state.
+        """Wait while the clock stands at a point of the path where hands are switched, and continue
+        when all inputs report the commanded state.
 
         Args:
             dt: time since the last call [s].

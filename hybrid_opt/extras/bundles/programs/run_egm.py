@@ -88,10 +88,10 @@ class Press:
         self._speed, self._compliance = config["speed"], config["compliance"]
 
     def tick(self, dt: float, wanted: float, soon: float, felt: float | None) -> None:
-        """Move the pad for one time step, by changing `way`, so that the normal force approaches
-        the commanded one.
+        """Move the pad for one time step so that the normal force approaches the commanded one.
 
-        The pad moves to the depth at which the arms' compliance gives the force, corrected by the
+        The attribute `way`, the distance of the pad beyond its planned position, is changed. It
+        approaches the depth at which the arms' compliance gives the force, corrected by the
         integral of the measured error. Its speed and depth are bounded.
 
         Args:
