@@ -1,4 +1,4 @@
-"""Evaluation of a candidate for the polish: on the task's samples and at places between them."""
+"""Evaluation of a candidate for the polish: on the task's samples and at points between them."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from symbolic.array import Array
 from symbolic.contact.registry import contact_model
 from symbolic.records.task import POSE_SIZE, place_redundant
 from symbolic.robot.arm import REACH_TOLERANCE
-from symbolic.smooth.places import ManipulabilityLimit
+from symbolic.smooth.path_points import ManipulabilityLimit
 
 SEPARATING_AXES_BELOW = 0.1
 """Lower bounds of the payload's distances that are smaller than this are improved by the gaps along
 separating axes [m]."""
 
 MINIMA_BELOW = 0.1
-"""Minima between places are interpolated only for pairs that come closer than this [m]."""
+"""Minima between points are interpolated only for pairs that come closer than this [m]."""
 
 DISTANCE_BATCH = 8
 """Number of distances that are measured together in the search for the first violation."""
 
 Stretch = tuple[slice, int]
-"""A range of places of the path, as a slice with a start, and the index of a pair."""
+"""A range of points of the path, as a slice with a start, and the index of a pair."""
 
 
 @dataclass(frozen=True)
 class PlacedCarry:
-    """A candidate evaluated at m places along the path, and at the task's n samples.
+    """A candidate evaluated at m points along the path, and at the task's n samples.
 
     Attributes:
         waypoints: (n_waypoints, 6 + k) box poses of the waypoints, each followed by k redundant
             joints [m, rad].
         pose, rate: (m, 6) box poses [m, rad] and their first derivatives by the path parameter.
-        q: (m, joints) joint positions of each arm [rad]; undefined from place `reached` on.
-        reached: number of places before the first one out of an arm's reach.
-        unreachable_arms: indices of the arms that do not reach all places.
+        q: (m, joints) joint positions of each arm [rad]; undefined from point `reached` on.
+        reached: number of points before the first one out of an arm's reach.
+        unreachable_arms: indices of the arms that do not reach all points.
         manipulability: (reached, 2) absolute determinant of each arm's Jacobian over its least
             allowed value.
         split: (n, 2) two quantities [N] from which the normal forces follow: for soft fingers both
@@ -50,7 +50,7 @@ class PlacedCarry:
         force: (n, 2) normal forces that are minimised, planned or robust [N].
         peak: (2,) largest of these forces of each robot over its reference force.
         shift: (n, 2) shifts of the centres of pressure over the patch radii.
-        distances: distances of all checked pairs of bodies at the places within reach.
+        distances: distances of all checked pairs of bodies at the points within reach.
         gaps: function from the index of a pair of the payload and a single obstacle box to its gaps
             along several directions (reached, SEPARATING_DIRECTIONS) [m].
     """
@@ -71,7 +71,7 @@ class PlacedCarry:
 
     @property
     def is_reachable(self) -> bool:
-        """True if both arms reach all places."""
+        """True if both arms reach all points."""
         return self.reached == len(self.pose)
 
 
@@ -83,7 +83,7 @@ def local_minima_below(values: Array, limit: float, stride: int | None = None) -
     Args:
         values: (n,) values along the path.
         limit: the limit, in the unit of the values.
-        stride: distance, as a number of values, at which further places of each stretch are
+        stride: distance, as a number of values, at which further points of each stretch are
             returned on both sides of the lowest value; None for the lowest values alone.
 
     Returns:
@@ -93,20 +93,20 @@ def local_minima_below(values: Array, limit: float, stride: int | None = None) -
     if not below.any():
         return []
     edges = np.diff(np.concatenate([[0], below.astype(np.int8), [0]]))
-    places: list[int] = []
+    points: list[int] = []
     for start, stop in zip(
         np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True
     ):
         least = start + int(np.argmin(values[start:stop]))
         if stride is None:
-            places.append(least)
+            points.append(least)
         else:
-            places += range(least - (least - start) // stride * stride, stop, stride)
-    return places
+            points += range(least - (least - start) // stride * stride, stop, stride)
+    return points
 
 
 def interpolate_minima(clearance: Array) -> Array:
-    """Estimate the minima of clearances between sampled places, and lower the samples beside them
+    """Estimate the minima of clearances between sampled points, and lower the samples beside them
     to these minima.
 
     While a body passes an edge, its clearance falls linearly to a kink and then rises linearly. The
@@ -114,7 +114,7 @@ def interpolate_minima(clearance: Array) -> Array:
     through the first two samples after it.
 
     Args:
-        clearance: (n, k) clearances [m] of k pairs of bodies at n successive places.
+        clearance: (n, k) clearances [m] of k pairs of bodies at n successive points.
 
     Returns:
         (n, k) clearances [m]. Where there is a kink between two samples, both are lowered to the
@@ -135,20 +135,20 @@ def interpolate_minima(clearance: Array) -> Array:
 
 
 class Distances:
-    """Distances between the pairs of bodies of one candidate at n places of its path.
+    """Distances between the pairs of bodies of one candidate at n points of its path.
 
     A distance is measured when it is first needed, and stored.
 
     Attributes:
         bounds: (n, n_pairs) lower bounds of the distances [m].
-        interpolated_clearance: (n, n_pairs) these bounds, lowered to their minima between places
+        interpolated_clearance: (n, n_pairs) these bounds, lowered to their minima between points
             [m].
     """
 
     def __init__(
         self, bounds: Array, measure: Callable[..., object], configuration: Sequence[NDArray[Any]]
     ) -> None:
-        """Estimate the distance of each pair of bodies at n places from lower bounds; nothing is
+        """Estimate the distance of each pair of bodies at n points from lower bounds; nothing is
         measured yet.
 
         Bounds of close pairs are lowered by `interpolate_minima`.
@@ -158,7 +158,7 @@ class Distances:
             measure: `CollisionChecker.measure`, which raises chosen bounds to measured distances in
                 place.
             configuration: the first three arguments of `measure`: box poses, and joint positions of
-                the first and of the second arm, at the n places.
+                the first and of the second arm, at the n points.
         """
         near = bounds.min(axis=0, initial=np.inf) < MINIMA_BELOW
         self.bounds, self.interpolated_clearance = bounds, bounds.copy()
@@ -175,8 +175,8 @@ class Distances:
             limits: (n_pairs,) limit of each pair [m].
 
         Returns:
-            By index of the pair, distances (n,) at all places [m], for each pair whose lower bound
-            is below its limit at some place. Distances are measured at these places; elsewhere a
+            By index of the pair, distances (n,) at all points [m], for each pair whose lower bound
+            is below its limit at some point. Distances are measured at these points; elsewhere a
             lower bound may take the place of the distance.
         """
         close = self.interpolated_clearance < limits
@@ -184,16 +184,16 @@ class Distances:
         pairs = np.flatnonzero(close.any(axis=0)).tolist()
         return {pair: self._values[:, pair].copy() for pair in pairs}
 
-    def _measure_pairs(self, places: NDArray[np.intp], pairs: NDArray[np.intp]) -> None:
-        if not len(places):
+    def _measure_pairs(self, points: NDArray[np.intp], pairs: NDArray[np.intp]) -> None:
+        if not len(points):
             return
-        rows, local = np.unique(places, return_inverse=True)
+        rows, local = np.unique(points, return_inverse=True)
         wanted = np.zeros((len(rows), self.bounds.shape[1]), dtype=np.bool_)
         wanted[local, pairs] = True
         raised = self.bounds[rows]
         self._measure(*(part[rows] for part in self._configuration), raised, wanted)
-        self._values[places, pairs] += raised[local, pairs] - self.bounds[places, pairs]
-        self._unmeasured[places, pairs] = False
+        self._values[points, pairs] += raised[local, pairs] - self.bounds[points, pairs]
+        self._unmeasured[points, pairs] = False
 
     def least(self, stretches: Sequence[Stretch], below: float) -> list[float]:
         """Return the least distance [m] in each of several stretches of the path.
@@ -203,7 +203,7 @@ class Distances:
         the least bound is returned.
 
         Args:
-            stretches: for each stretch, the slice of its successive places and the index of the
+            stretches: for each stretch, the slice of its successive points and the index of the
                 pair of bodies.
             below: only distances with lower bounds below this one are measured [m].
         """
@@ -212,17 +212,17 @@ class Distances:
             lowest = dict[int, tuple[int, int]]()
             for k in open_:
                 where, pair = stretches[k]
-                place = where.start + int(self._values[where, pair].argmin())
-                found[k] = float(self._values[place, pair])
-                if self._unmeasured[place, pair] and self.bounds[place, pair] < below:
-                    lowest[k] = place, pair
+                point = where.start + int(self._values[where, pair].argmin())
+                found[k] = float(self._values[point, pair])
+                if self._unmeasured[point, pair] and self.bounds[point, pair] < below:
+                    lowest[k] = point, pair
             chosen = np.array(sorted(set(lowest.values())), dtype=np.intp).reshape(-1, 2)
             self._measure_pairs(chosen[:, 0], chosen[:, 1])
             open_ = list(lowest)
         return found
 
     def exceed(self, limits: Array) -> bool:
-        """Return True if no pair of bodies is closer than its limit at any place.
+        """Return True if no pair of bodies is closer than its limit at any point.
 
         Distances are measured in order of their lower bounds, the least first. A distance below its
         limit ends the search.
@@ -230,19 +230,19 @@ class Distances:
         Args:
             limits: (n_pairs,) least allowed distance of each pair [m].
         """
-        places, pairs = (self.interpolated_clearance < limits).nonzero()
-        order = np.argsort(self.interpolated_clearance[places, pairs], kind="stable")
+        points, pairs = (self.interpolated_clearance < limits).nonzero()
+        order = np.argsort(self.interpolated_clearance[points, pairs], kind="stable")
         for first in range(0, len(order), DISTANCE_BATCH):
             some = order[first : first + DISTANCE_BATCH]
-            fresh = some[self._unmeasured[places[some], pairs[some]]]
-            self._measure_pairs(places[fresh], pairs[fresh])
-            if (self._values[places[some], pairs[some]] < limits[pairs[some]]).any():
+            fresh = some[self._unmeasured[points[some], pairs[some]]]
+            self._measure_pairs(points[fresh], pairs[fresh])
+            if (self._values[points[some], pairs[some]] < limits[pairs[some]]).any():
                 return False
         return True
 
 
 class CarryReader:
-    """Evaluates candidates of one cell at places along the path."""
+    """Evaluates candidates of one cell at points along the path."""
 
     def __init__(self, cell: SmoothCell) -> None:
         self._cell = cell
@@ -256,7 +256,7 @@ class CarryReader:
         )
 
     def read(self, x: Array) -> PlacedCarry:
-        """Evaluate a candidate at all places of the path.
+        """Evaluate a candidate at all points of the path.
 
         Args:
             x: (n_var,) decision vector.

@@ -1,4 +1,4 @@
-"""Shared data of a cell's programs: compiled functions, places of the path, scaled variables."""
+"""Shared data of a cell's programs: compiled functions, points of the path, scaled variables."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from symbolic.records.cell import Workcell
 from symbolic.records.task import POSE_SIZE, Task, extended_waypoints
 from symbolic.smooth.driven import driven_functions
 from symbolic.smooth.passage import GAPS, AxisSwitchGap, SeparatingAxisGap, gap_function
-from symbolic.smooth.places import (
+from symbolic.smooth.path_points import (
     ORDERS,
     JointLimit,
     ManipulabilityLimit,
@@ -57,9 +57,9 @@ few, so their functions are made on first use and cached."""
 
 ARMS = (0, 1)
 
-PLACE_SPACING = 0.0025
-"""Approximate distance of neighbouring places in the path parameter. The clearance covers minima
-between two places, and the final certification checks them."""
+POINT_SPACING = 0.0025
+"""Approximate distance of neighbouring points in the path parameter. The clearance covers minima
+between two points, and the final certification checks them."""
 
 Indices = NDArray[np.intp]
 
@@ -70,12 +70,12 @@ class PolishFunctions:
     Attributes:
         built: the functions by name, described in `symbolic.smooth`: forces and pressure at
             samples, inverse kinematics of both arms, in drivable cells limits along a driven path,
-            and constraints at places of the path. Functions for other constraints are added on
+            and constraints at points of the path. Functions for other constraints are added on
             first use.
         closure: `closure(arm, order)` returns the function from the box pose to the joint positions
-            of an arm, with first or second derivatives, see `symbolic.smooth.places`.
-        row: `row(constraint, order)` returns the function of a constraint at a place, with first or
-            second derivatives, see `symbolic.smooth.places.row_function`.
+            of an arm, with first or second derivatives, see `symbolic.smooth.path_points`.
+        row: `row(constraint, order)` returns the function of a constraint at a point, with first or
+            second derivatives, see `symbolic.smooth.path_points.row_function`.
         numbers: `numbers(constraint)` returns the constraint's parameters (n,).
         arms: `arms(constraint)` returns the indices of the arms on whose joints the constraint
             depends.
@@ -86,12 +86,12 @@ class PolishFunctions:
 
     def __init__(self, compiled: CompiledCell, built: Mapping[str, NumericFunction]) -> None:
         self.model, self.built, self._cell = compiled.bodies, dict(built), compiled
-        self._place, self._symbols = PathPointSymbols(self.model), cache(PathPointSymbols)
+        self._point, self._symbols = PathPointSymbols(self.model), cache(PathPointSymbols)
         # Every iteration asks for all of its rows.
         self.row, self.closure = cache(self._row), cache(self._closure)
         self.numbers, self.arms = cache(self._numbers), cache(self._arms)
-        self._obstacle = cache(self._place.obstacle)
-        self.separable = frozenset(self._place.separable())
+        self._obstacle = cache(self._point.obstacle)
+        self.separable = frozenset(self._point.separable())
 
     def _closure(self, arm: int, order: Order) -> NumericFunction:
         return self.built[closure_name(arm, order)]
@@ -107,7 +107,7 @@ class PolishFunctions:
         return self.built[name]
 
     def _numbers(self, constraint: PathConstraint) -> Array:
-        return constraint.numbers(self._place)
+        return constraint.numbers(self._point)
 
     def _arms(self, constraint: PathConstraint) -> tuple[int, ...]:
         return constraint.arms(self.model)
@@ -150,7 +150,7 @@ def sample_quantities(workcell: Workcell) -> tuple[Quantity, ...]:
 def polish_functions(compiled: CompiledCell) -> PolishFunctions:
     """Load the compiled functions for the polish of a workcell, or build them.
 
-    Functions of many samples or places per call are compiled for evaluation in lanes (several
+    Functions of many samples or points per call are compiled for evaluation in lanes (several
     evaluations by one vector instruction) at optimisation level 1. Higher levels take three times
     as long to compile and gain nothing (measured on the rack: every function within 5 %, one slower
     by 40 %). For the first and the last two samples, only second derivatives are evaluated in
@@ -177,13 +177,13 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
         return {name: f for name, f in samples(model).items() if name not in wide}
 
     def rows(model: CellModel) -> dict[str, ca.Function]:
-        place = PathPointSymbols(model)
+        point = PathPointSymbols(model)
         found = {
-            row_name(constraint.family, order): row_function(place, constraint, order)
+            row_name(constraint.family, order): row_function(point, constraint, order)
             for constraint in PRECOMPILED
             for order in ORDERS
         }
-        return found | {GAPS: gap_function(place)}
+        return found | {GAPS: gap_function(point)}
 
     details = str(levels)
     taped = partial(compiled.functions, levels=levels, lanes=0, taped=True)
@@ -236,27 +236,27 @@ def _names(quantities: tuple[Quantity, ...]) -> set[str]:
 
 
 class Grid:
-    """Places along a task's path: the task's samples, and equally many places between neighbours.
+    """Points along a task's path: the task's samples, and equally many points between neighbours.
 
     Attributes:
-        per_sample: number of places per interval between samples.
-        parameter: (m,) path parameter of all places, in [0, 1].
+        per_sample: number of points per interval between samples.
+        parameter: (m,) path parameter of all points, in [0, 1].
         sample_parameter: (n,) path parameter of the samples.
-        basis: (m, n_waypoints) matrix B: the poses at the places are B W for waypoints W, both box
+        basis: (m, n_waypoints) matrix B: the poses at the points are B W for waypoints W, both box
             poses with redundant joints.
         rate_basis: (m, n_waypoints) like B, for the poses' first derivatives by the path parameter.
     """
 
     def __init__(self, task: Task) -> None:
         intervals = task.samples - 1
-        self.per_sample = max(1, round(1.0 / (intervals * PLACE_SPACING)))
+        self.per_sample = max(1, round(1.0 / (intervals * POINT_SPACING)))
         self.sample_parameter = np.linspace(0.0, 1.0, task.samples)
         self.parameter = np.linspace(0.0, 1.0, intervals * self.per_sample + 1)
         along = path_basis(len(task.waypoints), self.parameter)
         self.basis, self.rate_basis = along.position, along.first
 
-    def places(self, width: float) -> int:
-        """Convert a width in the path parameter to a number of intervals between places, at least
+    def points(self, width: float) -> int:
+        """Convert a width in the path parameter to a number of intervals between points, at least
         one.
         """
         return max(1, round(width * (len(self.parameter) - 1)))
@@ -268,23 +268,23 @@ class Grid:
         return max(1, round(width * (len(self.sample_parameter) - 1)))
 
     def between(self, values: Array) -> Array:
-        """Interpolate values at the n samples linearly to all m places.
+        """Interpolate values at the n samples linearly to all m points.
 
         Args:
             values: (n, k) k values at each sample.
 
         Returns:
-            (m, k) values at the places.
+            (m, k) values at the points.
         """
         return np.column_stack(
             [np.interp(self.parameter, self.sample_parameter, column) for column in values.T]
         )
 
-    def movable(self, place: int) -> bool:
-        """Return True if a place, given by its index, is neither the first nor the last of the
+    def movable(self, point: int) -> bool:
+        """Return True if a point, given by its index, is neither the first nor the last of the
         path, which are fixed.
         """
-        return 0 < place < len(self.parameter) - 1
+        return 0 < point < len(self.parameter) - 1
 
 
 class SmoothCell:
@@ -294,7 +294,7 @@ class SmoothCell:
         evaluator: evaluator of candidates by the full model.
         functions: compiled functions of the polish.
         workcell, task: the evaluator's workcell and its task.
-        grid: places along the task's path.
+        grid: points along the task's path.
         clearance: distance that bodies keep beyond the collision tolerance [m].
         robust: computes robust forces at samples if these are minimised; None for planned forces.
         centre, half: (n_var,) middle and half range of each decision variable [m, rad, N]. Scaled
@@ -311,7 +311,7 @@ class SmoothCell:
     def __init__(
         self, evaluator: CandidateEvaluator, functions: PolishFunctions, clearance: float
     ) -> None:
-        """Derive from a cell's task the half ranges and centre of the variables, the grid of places
+        """Derive from a cell's task the half ranges and centre of the variables, the grid of points
         and the blocks of samples.
 
         Args:

@@ -336,7 +336,7 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
 
         Args:
             best: the best iterate so far.
-            required: value that each geometric row (scalar inequality at a place of the path) has
+            required: value that each geometric row (scalar inequality at a point of the path) has
                 to exceed.
             radius: half the width of the trust region [half ranges of the variables].
 
@@ -372,7 +372,7 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         d = second.answer.d
         squared = best.squared.copy()
         squared[1:-1] *= 1.0 + d[program.speeds]
-        rows = program.place_rows
+        rows = program.geometric_rows
         is_active = (
             second.answer.rows[len(second.linear.point) :][: len(rows)] > NEGLIGIBLE_MULTIPLIER
         )

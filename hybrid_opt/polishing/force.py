@@ -8,7 +8,7 @@ anchor, span, direction, offset and cost of the scalarisation,
     subject to  (N_i,k(x) / N_ref,i - anchor_i) / span_i <= phi_i    chosen samples k, robot i
                 phi_j <= direction_j a + offset_j                    both objectives
                 1 - (shift_i,k(x) / patch radius_i)^2 >= margin      chosen robots and samples
-                c_r(x) / scale_r >= required_r / scale_r             chosen rows at chosen places.
+                c_r(x) / scale_r >= required_r / scale_r             chosen rows at chosen points.
 
 A direction of ones is the scalarisation of Pascoletti and Serafini (1984). Another set of rows
 costs only its choice. Joints as variables with closure constraints have the same optima and take
@@ -222,7 +222,7 @@ class ForceProgram:
             required: value that each row (scalar inequality) has to exceed; for force rows it is
                 not used.
             target: the scalarisation that is minimised.
-            carry: the candidate, evaluated at places of the path.
+            carry: the candidate, evaluated at points of the path.
             x: (n_var,) decision vector of the candidate.
             radius: half the width of the trust region [half ranges of the variables].
         """
@@ -266,7 +266,7 @@ class ForceProgram:
         offset[layout.sides] = target.offset
         offset[layout.patches] = 1.0 - carry.shift[at, pressed] ** 2 - self._rows.left
         offset[layout.patches] -= [required[row] for row in layout.pressure_rows]
-        offset[layout.places] = [-required[row] / row.constraint.scale for row in layout.place_rows]
+        offset[layout.points] = [-required[row] / row.constraint.scale for row in layout.point_rows]
 
         phi = (carry.peak - target.anchor) / target.span + EPIGRAPH_SLACK
         xi, low, high = (cell.scaled(v) for v in (x, cell.task.lower, cell.task.upper))
@@ -326,7 +326,7 @@ class ForceProgram:
 
         Args:
             x: (n_var,) decision vector of the candidate.
-            carry: the candidate, evaluated at places of the path.
+            carry: the candidate, evaluated at points of the path.
         """
         target = self._target
         phi = (carry.peak - target.anchor) / target.span
@@ -449,7 +449,7 @@ class ForceSolver:
     Attributes:
         cell: shared data of the polish.
         active: selects the rows of programs.
-        reader: evaluates candidates at places of the path.
+        reader: evaluates candidates at points of the path.
         method: solver of the nonlinear programs.
     """
 

@@ -501,10 +501,10 @@ class ForceRun(PolishRun[ForceAttempt]):
     def _is_far(self, objectives: Array) -> bool:
         """Return True if objectives (2,) lie beyond the front's ends or in a gap over `FAR_GAP`."""
         f = [self._archive.objectives[k][0] for k in self._archive.front_indices()]
-        place = int(np.searchsorted(f, objectives[0]))
-        if place in (0, len(f)):
+        following = int(np.searchsorted(f, objectives[0]))
+        if following in (0, len(f)):
             return True
-        return gaps(self._archive)[place - 1].width > FAR_GAP
+        return gaps(self._archive)[following - 1].width > FAR_GAP
 
     def _gaps(self, solved: int) -> Iterator[ForceAttempt]:
         """Yield attempts that fill gaps, until the front has `solved` points or attempts started at

@@ -308,7 +308,7 @@ class IntervalValues:
         second = self._functions.built[DRIVEN_SECOND]
         change = second.batch(*repeated, *along_all, threads=self._grid.threads)["change"]
         total = change.reshape(n, local, variables) @ np.swapaxes(spread, 1, 2)
-        # How the joints' own curvature along the path adds to it, see `symbolic.smooth.places`.
+        # How the joints' own curvature along the path adds to it (`symbolic.smooth.path_points`).
         slope = np.einsum("pk,pkv->pv", weight[at], self._full[at])
         start = moving
         for arm, along in enumerate(self._follow):
@@ -423,7 +423,7 @@ class PathTimingProgram:
     omega is around one.
 
     Attributes:
-        place_rows: geometric rows, in order.
+        geometric_rows: geometric rows, in order.
         n, n_path: number of variables, and of those that move the path.
         speeds: slice of omega among the variables.
         total: duration of the iterate [s].
@@ -450,9 +450,9 @@ class PathTimingProgram:
             x: (n_var,) decision vector of the iterate, the force limit last.
             squared: (intervals + 1,) squared path speeds u'^2 of the iterate [1/s^2].
             cell: shared data of the polish.
-            required: value that each geometric row (scalar inequality at a place of the path) has
+            required: value that each geometric row (scalar inequality at a point of the path) has
                 to exceed.
-            carry: the iterate at places of the path.
+            carry: the iterate at points of the path.
         """
         self._grid, self._values, self._x, self._force = grid, values, x, float(x[-1])
         self._spread, self.n_path = grid.spread, grid.spread.shape[1]
@@ -461,16 +461,16 @@ class PathTimingProgram:
         self.scale = np.where(grid.kinds.is_force, self._force, 1.0)
         self.rows = values.rows() / self.scale - 1.0
         layout = RowLayout(required)
-        self.place_rows = layout.place_rows
+        self.geometric_rows = layout.point_rows
         # Slopes of the timing's rows by both parts of z, of those that were chosen so far.
         self._known = np.zeros(self.rows.shape, dtype=np.bool_)
         self._by_path = np.empty((*self.rows.shape, self.n_path))
         self._by_speeds = np.empty((*self.rows.shape, 2))
-        scale = np.array([row.constraint.scale for row in self.place_rows])
-        self._required = np.array([required[row] for row in self.place_rows]) / scale
-        self._places = ConstraintRows(cell, layout, carry.q)
-        self.geometry = self._required - self._places.values(x)
-        self._geometry_slope = -self._places.slopes()[:, : len(grid.spread)] @ grid.spread
+        scale = np.array([row.constraint.scale for row in self.geometric_rows])
+        self._required = np.array([required[row] for row in self.geometric_rows]) / scale
+        self._geometry_rows = ConstraintRows(cell, layout, carry.q)
+        self.geometry = self._required - self._geometry_rows.values(x)
+        self._geometry_slope = -self._geometry_rows.slopes()[:, : len(grid.spread)] @ grid.spread
         self._still(values)
         self._speeds(squared)
 
@@ -530,7 +530,7 @@ class PathTimingProgram:
         """
         x, step = self._x.copy(), d[: self.n_path]
         x[: len(self._spread)] += self._spread @ step
-        lacking = self._required - self._places.values(x)
+        lacking = self._required - self._geometry_rows.values(x)
         beyond = np.zeros(len(self.geometry))
         foretold = self.geometry + self._geometry_slope @ step
         beyond[: len(lacking)] = lacking - foretold[: len(lacking)]
@@ -640,10 +640,10 @@ class PathTimingProgram:
             for other in (0, 1):
                 np.add.at(H, (column + side, column + other), own[:, side, other])
         H[:k, k:] = H[k:, :k].T
-        weight = unscaled[count : count + len(self.place_rows)]
+        weight = unscaled[count : count + len(self.geometric_rows)]
         if weight.any():
             whole = len(self._spread)
-            second = self._places.curvature(weight)[:whole, :whole]
+            second = self._geometry_rows.curvature(weight)[:whole, :whole]
             H[:k, :k] -= self._spread.T @ second @ self._spread
         return H
 

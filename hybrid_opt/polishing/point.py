@@ -140,7 +140,7 @@ class Solution:
         residuals: optimality residuals at x, of the last program.
         iterations: number of solver iterations, over all trust-region iterations.
         rounds: number of trust-region iterations.
-        rows: number of rows (scalar inequalities) at places of the path in the last program.
+        rows: number of rows (scalar inequalities) at points of the path in the last program.
     """
 
     x: Array
@@ -159,7 +159,7 @@ class Iterate:
 
     Attributes:
         x: (n_var,) decision vector.
-        carry: the candidate, evaluated at places of the path.
+        carry: the candidate, evaluated at points of the path.
         level: the value that the solve minimises: a scalarisation of peak forces, or the duration
             [s].
     """
@@ -180,7 +180,7 @@ class Step:
         iterations: number of solver iterations.
         is_stationary: True if the iterate from which the step starts is stationary.
         converged: True if the solver reports that it solved the program to optimality.
-        active_rows: rows at places of the path with a nonzero multiplier.
+        active_rows: rows at points of the path with a nonzero multiplier.
     """
 
     length: float
@@ -227,7 +227,7 @@ class StepMethod(ABC, Generic[AnyIterate, AnyStep]):
     Attributes:
         cell: shared data of the polish.
         active: selects the rows (scalar inequalities) near a candidate.
-        reader: evaluates candidates at places of the path.
+        reader: evaluates candidates at points of the path.
         half: (n,) half ranges of the variables that steps change [m, rad].
         limits: for each robot, True if its normal force is minimised.
         least_radius: radius below which the solve ends.

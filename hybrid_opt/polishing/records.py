@@ -35,7 +35,7 @@ class PolishOutcome:
         residuals: optimality residuals of the solver's last result, accepted or not.
         iterations: solver iterations, over all trust-region iterations.
         rounds: number of trust-region iterations.
-        rows: number of rows (scalar inequalities) at places of the path in the last program.
+        rows: number of rows (scalar inequalities) at points of the path in the last program.
         seconds: wall time of the attempt, full evaluation and certification included.
     """
 

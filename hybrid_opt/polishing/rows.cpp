@@ -1,6 +1,6 @@
 // The rows of a smooth program: values, slopes, weighted second derivatives.
 //
-// `rows.py` lays the arrays out; `symbolic/smooth/places.py` has the formulas. Matrices that functions
+// `rows.py` lays the arrays out; `symbolic/smooth/path_points.py` has the formulas. Matrices that functions
 // of CasADi return are transposed ones. Rows at places stand family by family.
 
 #include "native.hpp"

@@ -1,9 +1,9 @@
 """Rows of a smooth program: their values, slopes and weighted curvature.
 
-A row belongs to a sample or to a place of the path. Forces and pressure at samples are functions of
-the decision vector; rows at a place depend on the box pose and its rate there, which are linear in
-the decision vector, and on the joints that hold the box (`symbolic.smooth.places` has the
-formulas). CasADi functions give values and derivatives of many samples or places per call. Here
+A row belongs to a sample or to a point of the path. Forces and pressure at samples are functions of
+the decision vector; rows at a point depend on the box pose and its rate there, which are linear in
+the decision vector, and on the joints that hold the box (`symbolic.smooth.path_points` has the
+formulas). CasADi functions give values and derivatives of many samples or points per call. Here
 their arrays are laid out; `rows.cpp` calls the functions and assembles the rows: in NumPy, with
 many small arrays, the assembly takes longer than the functions themselves.
 """
@@ -22,7 +22,7 @@ from hybrid_opt.polishing.cell import Indices, PolishFunctions, SmoothCell
 from hybrid_opt.polishing.solvers.base import native
 from symbolic.array import Array
 from symbolic.records.task import POSE_SIZE
-from symbolic.smooth.places import ORDERS, PathConstraint
+from symbolic.smooth.path_points import ORDERS, PathConstraint
 from symbolic.smooth.samples import QUANTITY_WIDTHS, Quantity, grasp_force_name, sample_name
 
 PROGRAM_BRANCH = 5
@@ -65,15 +65,15 @@ class PressureRow:
 
 @dataclass(frozen=True)
 class PathRow:
-    """The inequality of one geometric constraint at one place of the path.
+    """The inequality of one geometric constraint at one point of the path.
 
     Attributes:
         constraint: the constraint.
-        place: index of the place.
+        point: index of the point.
     """
 
     constraint: PathConstraint
-    place: int
+    point: int
 
 
 Row = ForceRow | PressureRow | PathRow
@@ -87,11 +87,11 @@ def _sort_key(constraint: PathConstraint) -> tuple[str, str]:
 
 class RowLayout:
     """Order of a program's rows (scalar inequalities): blocks of forces, objectives, patches and
-    places, each sorted.
+    points, each sorted.
 
     Attributes:
-        force_rows, pressure_rows, place_rows: rows of the blocks of forces, patches and places.
-        forces, sides, patches, places: position of each block among all rows, as a slice; `sides`
+        force_rows, pressure_rows, point_rows: rows of the blocks of forces, patches and points.
+        forces, sides, patches, points: position of each block among all rows, as a slice; `sides`
             is the block of objectives.
         n_rows: number of all rows.
     """
@@ -100,13 +100,13 @@ class RowLayout:
         listed = list(rows)
         self.force_rows = sorted(row for row in listed if isinstance(row, ForceRow))
         self.pressure_rows = sorted(row for row in listed if isinstance(row, PressureRow))
-        places = [row for row in listed if isinstance(row, PathRow)]
-        self.place_rows = sorted(places, key=lambda row: (_sort_key(row.constraint), row.place))
+        points = [row for row in listed if isinstance(row, PathRow)]
+        self.point_rows = sorted(points, key=lambda row: (_sort_key(row.constraint), row.point))
         self.forces = slice(0, len(self.force_rows))
         self.sides = slice(self.forces.stop, self.forces.stop + sides)
         self.patches = slice(self.sides.stop, self.sides.stop + len(self.pressure_rows))
-        self.places = slice(self.patches.stop, self.patches.stop + len(places))
-        self.n_rows = int(self.places.stop)
+        self.points = slice(self.patches.stop, self.patches.stop + len(points))
+        self.n_rows = int(self.points.stop)
 
 
 class _SampleRows:
@@ -189,7 +189,7 @@ class ConstraintRows:
 
     The value of row r is offset_r + fixed_r . tail + own_r(x). For a force row own_r is mix_r times
     the two force quantities of its sample; for a pressure row the unused share of the patch; for a
-    place row the constraint over its scale. Use an object in one thread only.
+    point row the constraint over its scale. Use an object in one thread only.
 
     Attributes:
         offset: (n_rows,) offsets, to be set by the caller.
@@ -208,7 +208,7 @@ class ConstraintRows:
         Args:
             cell: shared data of the polish.
             layout: order of the rows.
-            q: joint positions of each arm, (m, n) for m places and n joints [rad]. They are close
+            q: joint positions of each arm, (m, n) for m points and n joints [rad]. They are close
                 to the positions that hold the box.
             mix: (n_forces, 2) two coefficients of each force row; None without force rows. With the
                 paper's contact model they multiply the normal and the tangential part of the
@@ -224,7 +224,7 @@ class ConstraintRows:
             mix=np.zeros((0, 2)) if mix is None else mix,
             fixed=np.zeros((layout.n_rows, 0)) if fixed is None else fixed,
             **self._lay_out_samples(layout),
-            **self._lay_out_places(layout, q),
+            **self._lay_out_points(layout, q),
         )
 
     def _lay_out_samples(self, layout: RowLayout) -> dict[str, Any]:
@@ -281,27 +281,28 @@ class ConstraintRows:
             "first_patch": layout.patches.start,
         }
 
-    def _lay_out_places(self, layout: RowLayout, q: tuple[Array, Array]) -> dict[str, Any]:
-        """Build the arguments of the C++ class `Rows` (rows.cpp) that describe the place rows.
+    def _lay_out_points(self, layout: RowLayout, q: tuple[Array, Array]) -> dict[str, Any]:
+        """Build the arguments of the C++ class `Rows` (rows.cpp) that describe the rows at points
+        of the path.
 
         Rows with the same compiled function form a group. Joint positions are solved for once per
-        place, also if several rows need them.
+        point, also if several rows need them.
 
         Args:
             layout: order of the rows.
-            q: joint positions of each arm, (m, n) for m places and n joints [rad]. They are close
+            q: joint positions of each arm, (m, n) for m points and n joints [rad]. They are close
                 to the positions that hold the box.
 
         Returns:
             Arguments by the names that rows.cpp gives them.
         """
-        cell, rows = self._cell, layout.place_rows
+        cell, rows = self._cell, layout.point_rows
         members: dict[NumericFunction, list[int]] = {}
         for k, row in enumerate(rows):
             members.setdefault(cell.functions.row(row.constraint, "first"), []).append(k)
         order = np.array([k for own in members.values() for k in own], dtype=np.intp)
-        there = np.unique(np.array([row.place for row in rows], dtype=np.intp))
-        at = np.searchsorted(there, np.array([rows[k].place for k in order], dtype=np.intp))
+        there = np.unique(np.array([row.point for row in rows], dtype=np.intp))
+        at = np.searchsorted(there, np.array([rows[k].point for k in order], dtype=np.intp))
         n, (free_row, free_column) = len(rows), cell.free
         basis, rate_basis = cell.grid.basis[there], cell.grid.rate_basis[there]
         shared = {
@@ -322,21 +323,21 @@ class ConstraintRows:
             groups.append({"start": start, **group})
             start = stop
         arms = []
-        for arm, own_places in enumerate(needed):
-            places = np.unique(np.concatenate(own_places))
+        for arm, own_points in enumerate(needed):
+            points = np.unique(np.concatenate(own_points))
             position = np.zeros(len(there), dtype=np.intp)
-            position[places] = np.arange(len(places))
+            position[points] = np.arange(len(points))
             function, second = (cell.functions.closure(arm, order) for order in ORDERS)
-            first = function.prepared(max(1, len(places)))
-            first.inputs["q_reference"][: len(places)] = q[arm][there[places]]
+            first = function.prepared(max(1, len(points)))
+            first.inputs["q_reference"][: len(points)] = q[arm][there[points]]
             arms.append(
                 {
-                    "place": places,
+                    "place": points,
                     "at": position[at],
-                    "basis": basis[places],
+                    "basis": basis[points],
                     "rows": shared[f"q_{arm + 1}"],
                     "first": first,
-                    "second": partial(second.prepared, len(places)),
+                    "second": partial(second.prepared, len(points)),
                 }
             )
         scale = np.array([row.constraint.scale for row in rows], dtype=float)
@@ -344,7 +345,7 @@ class ConstraintRows:
             "size": cell.task.extended_size,
             "groups": groups,
             "arms": arms,
-            "order": layout.places.start + order,
+            "order": layout.points.start + order,
             "place": at,
             "scale": scale[order],
             "whole": basis[at],

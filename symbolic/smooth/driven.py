@@ -3,7 +3,7 @@ drivable carries.
 
 Path and timing are variables together. At a point of the path every limited quantity follows from
 the box pose, its first and second derivative along the path, the joints that hold the box at this
-pose, u'' and u'^2. Joints are differentiated as in `symbolic.smooth.places`.
+pose, u'' and u'^2. Joints are differentiated as in `symbolic.smooth.path_points`.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ The clearance of the payload from a box is the largest gap along one of a few di
 of both, and the cross products of an edge of each (the separating axis theorem, Gottschalk, Lin and
 Manocha 1996). A row with one of these gaps is smooth. Where the payload passes an edge, the
 separating direction changes, and the clearance has a kink. Rows with the larger of both gaps would
-tie each place of the path to its side of the edge. So the height of the kink is a row of its own:
-with the gaps g, before and after, and their rates g' along the path, both at a place near the kink,
+tie each point of the path to its side of the edge. So the height of the kink is a row of its own:
+with the gaps g, before and after, and their rates g' along the path, both at a point near the kink,
 
     height = (g_after' g_before - g_before' g_after) / (g_after' - g_before'),
 
@@ -23,7 +23,7 @@ import numpy as np
 from symbolic.array import Array
 from symbolic.expression import named_function, sx_parameters
 from symbolic.geometry.clearance import BOX_NUMBERS
-from symbolic.smooth.places import PathConstraint, PathPointSymbols
+from symbolic.smooth.path_points import PathConstraint, PathPointSymbols
 
 GAPS = "gaps"
 """Name of the function of `gap_function`."""
@@ -80,7 +80,7 @@ def direction_numbers(obstacle: Array, k: int) -> Array:
     return np.concatenate([turned[0], along_payload, turned[1], other])
 
 
-def direction(place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
+def direction(point: PathPointSymbols, numbers: ca.SX) -> ca.SX:
     """Return a direction (3,), world frame, that may separate an obstacle from the payload. It is
     not normalised.
 
@@ -88,28 +88,28 @@ def direction(place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
     of the payload, and the cross product of an edge of the obstacle and an edge of the payload.
 
     Args:
-        place: symbols of box pose and joints at one point of the path.
+        point: symbols of box pose and joints at one point of the path.
         numbers: (DIRECTION_NUMBERS,) four vectors (3,): axis of the obstacle, world frame; axis of
             the payload, box frame; edge of the obstacle, world frame; edge of the payload, box
             frame.
     """
     fixed, own, edge, other = ca.vertsplit(numbers, 3)
-    turned = ca.mtimes(place.rotation, ca.horzcat(own, other))
+    turned = ca.mtimes(point.rotation, ca.horzcat(own, other))
     return fixed + turned[:, 0] + ca.cross(edge, turned[:, 1])
 
 
-def gap(place: PathPointSymbols, obstacle: ca.SX, numbers: ca.SX) -> ca.SX:
+def gap(point: PathPointSymbols, obstacle: ca.SX, numbers: ca.SX) -> ca.SX:
     """Build the expression of the gap between payload and obstacle along one separating direction
     [m], smoothed at its kinks. It is positive where the direction separates the two bodies.
 
     Args:
-        place: symbols of the box pose and the joints at one point of the path.
+        point: symbols of the box pose and the joints at one point of the path.
         obstacle: (BOX_NUMBERS,) rotation, centre and half edges of the obstacle, a box, in the
             world.
         numbers: (DIRECTION_NUMBERS,) coefficients of the direction, as `direction` takes them.
     """
-    n = direction(place, numbers)
-    return place.scene.separation(obstacle, n / ca.norm_2(n))
+    n = direction(point, numbers)
+    return point.scene.separation(obstacle, n / ca.norm_2(n))
 
 
 @dataclass(frozen=True, order=True)
@@ -128,24 +128,24 @@ class SeparatingAxisGap(PathConstraint):
     family: ClassVar[str] = "separation"
     scale: ClassVar[float] = 0.01
 
-    def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
+    def expression(self, point: PathPointSymbols, numbers: ca.SX) -> ca.SX:
         """Build the expression of the gap [m].
 
         Args:
-            place: symbols of the box pose and the joints at one point of the path.
+            point: symbols of the box pose and the joints at one point of the path.
             numbers: (count,) parameters of the obstacle, then coefficients of the direction.
         """
-        return gap(place, numbers[:BOX_NUMBERS], numbers[BOX_NUMBERS:])
+        return gap(point, numbers[:BOX_NUMBERS], numbers[BOX_NUMBERS:])
 
-    def count(self, place: PathPointSymbols) -> int:
+    def count(self, point: PathPointSymbols) -> int:
         """Return the number of parameters: BOX_NUMBERS of the obstacle and DIRECTION_NUMBERS of the
         direction."""
         return BOX_NUMBERS + DIRECTION_NUMBERS
 
-    def numbers(self, place: PathPointSymbols) -> Array:
+    def numbers(self, point: PathPointSymbols) -> Array:
         """Return the parameters (count,) of this constraint: those of the obstacle, then the
         coefficients of the direction."""
-        obstacle = place.obstacle(self.pair)
+        obstacle = point.obstacle(self.pair)
         return np.concatenate([obstacle, direction_numbers(obstacle, self.direction)])
 
 
@@ -171,13 +171,13 @@ class AxisSwitchGap(PathConstraint):
     scale: ClassVar[float] = 0.01
     moving: ClassVar[bool] = True
 
-    def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
+    def expression(self, point: PathPointSymbols, numbers: ca.SX) -> ca.SX:
         """Build the expression of a gap [m] at the kink where one separating direction takes over
         from another: both gaps, extended linearly along the path, have this value where they are
         equal.
 
         Args:
-            place: symbols of box pose and joints at a point of the path near the kink.
+            point: symbols of box pose and joints at a point of the path near the kink.
             numbers: (count,) parameters of the obstacle, then coefficients of the directions before
                 and after the kink.
         """
@@ -185,24 +185,24 @@ class AxisSwitchGap(PathConstraint):
             numbers[:BOX_NUMBERS],
             ca.vertsplit(numbers[BOX_NUMBERS:], DIRECTION_NUMBERS),
         )
-        before, after = (gap(place, obstacle, one) for one in both)
-        falls, rises = (ca.jtimes(one, place.pose, place.rate) for one in (before, after))
+        before, after = (gap(point, obstacle, one) for one in both)
+        falls, rises = (ca.jtimes(one, point.pose, point.rate) for one in (before, after))
         return (rises * before - falls * after) / (rises - falls)
 
-    def count(self, place: PathPointSymbols) -> int:
+    def count(self, point: PathPointSymbols) -> int:
         """Return the number of parameters: BOX_NUMBERS of the obstacle and DIRECTION_NUMBERS of
         each of the two directions."""
         return BOX_NUMBERS + 2 * DIRECTION_NUMBERS
 
-    def numbers(self, place: PathPointSymbols) -> Array:
+    def numbers(self, point: PathPointSymbols) -> Array:
         """Return the parameters (count,) of this constraint: those of the obstacle, then the
         coefficients of the directions before and after the kink."""
-        obstacle = place.obstacle(self.pair)
+        obstacle = point.obstacle(self.pair)
         both = [direction_numbers(obstacle, k) for k in (self.before, self.after)]
         return np.concatenate([obstacle, *both])
 
 
-def gap_function(place: PathPointSymbols) -> ca.Function:
+def gap_function(point: PathPointSymbols) -> ca.Function:
     """Build the function of the gaps between the payload and a box-shaped obstacle along all
     separating directions, with exact kinks.
 
@@ -217,10 +217,10 @@ def gap_function(place: PathPointSymbols) -> ca.Function:
     for shares in _SHARES:
         fixed, own, edge, other = (ca.DM(part) for part in shares.reshape(4, 3))
         turned = ca.vertcat(ca.mtimes(rotation, fixed), own, ca.mtimes(rotation, edge), other)
-        n = direction(place, turned)
+        n = direction(point, turned)
         squared = ca.sumsqr(n)
         unit = n / ca.sqrt(ca.fmax(squared, PARALLEL_SINE**2))
-        along = place.sharp_scene.separation(obstacle, unit)
+        along = point.sharp_scene.separation(obstacle, unit)
         found.append(ca.if_else(squared < PARALLEL_SINE**2, PARALLEL_GAP, along))
-    inputs = {"pose": place.pose, "obstacle": obstacle} | sx_parameters(place.model.screen)
+    inputs = {"pose": point.pose, "obstacle": obstacle} | sx_parameters(point.model.screen)
     return named_function(GAPS, inputs, {"gaps": ca.densify(ca.vertcat(*found))})

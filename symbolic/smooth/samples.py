@@ -42,7 +42,7 @@ from symbolic.path.spline import PathBasis, sample_basis, waypoint_matrix
 from symbolic.path.time_law import timed_path
 from symbolic.records.cell import Workcell
 from symbolic.records.task import Task
-from symbolic.smooth.places import ORDERS, Order
+from symbolic.smooth.path_points import ORDERS, Order
 
 Quantity = Literal["force", "pressure", "load"]
 """'force': quantities from which the normal forces follow (`ContactModel.force_quantities`) [N].

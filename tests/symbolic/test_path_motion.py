@@ -25,7 +25,7 @@ from symbolic.path_motion import path_motion_function
 from symbolic.records import Workcell
 from symbolic.records.poses import pose_matrix
 from symbolic.records.task import initial_decision
-from symbolic.smooth.places import closure_functions, closure_name
+from symbolic.smooth.path_points import closure_functions, closure_name
 from tests.odd_cells import free_pandas
 from tests.symbolic.cells import call, hand_cell, hand_model, with_contacts, with_payload
 
@@ -297,7 +297,7 @@ def test_the_closure_has_exact_derivatives_by_the_extended_pose(
         ends = [np.array(first(pose + sign * step, q)[0]).ravel() for sign in (1, -1)]
         columns.append((ends[0] - ends[1]) / (2 * width))
     np.testing.assert_allclose(follow, np.array(columns).T, atol=1e-7)
-    # The curvature of one joint along any direction, by the formula of `symbolic.smooth.places`.
+    # One joint's curvature along any direction, by the formula of `symbolic.smooth.path_points`.
     direction = np.random.default_rng(arm).normal(size=8)
     T = np.vstack([np.eye(8), follow])
     for joint in range(7):

@@ -38,7 +38,7 @@ from hybrid_opt.polishing.constraints.kinds import (
 from hybrid_opt.polishing.rows import ForceRow, PathRow, PressureRow, Row
 from symbolic.array import Array
 from symbolic.smooth.passage import AxisSwitchGap, SeparatingAxisGap
-from symbolic.smooth.places import Clearance, JointLimit, ManipulabilityLimit
+from symbolic.smooth.path_points import Clearance, JointLimit, ManipulabilityLimit
 
 LEAST_TIGHTENING = 1e-4
 """Smallest rise of a required value that counts as new [m, rad, 1]."""
@@ -75,7 +75,7 @@ class RowSelector:
         bounds at a candidate.
 
         Args:
-            carry: the candidate, evaluated at places of the path.
+            carry: the candidate, evaluated at points of the path.
             limits: for each robot, True if its normal force is minimised.
         """
         rows = set[Row]()
@@ -174,7 +174,7 @@ class RowSelector:
         return self._kinds[type(row.constraint) if isinstance(row, PathRow) else type(row)]
 
     def _counts(self, row: Row) -> bool:
-        return not isinstance(row, PathRow) or self._movable(row.place)
+        return not isinstance(row, PathRow) or self._movable(row.point)
 
     def _by_kind(self, rows: Iterable[Row]) -> dict[ConstraintKind[Any], list[Row]]:
         groups: dict[ConstraintKind[Any], list[Row]] = {}

@@ -28,7 +28,7 @@ from hybrid_opt.polishing.constraints.kinds import (
 from hybrid_opt.polishing.rows import PathRow
 from symbolic.array import Array
 from symbolic.smooth.passage import AxisSwitchGap, SeparatingAxisGap
-from symbolic.smooth.places import Clearance
+from symbolic.smooth.path_points import Clearance
 
 BODY_DISTANCE = 0.03
 """A pair with an arm's body gets rows at its minima below this distance [m]."""
@@ -51,7 +51,7 @@ KINK_DISTANCE = 0.06
 
 BESIDE_KINK = 0.03
 """Distance along the path from a kink within which gaps get no rows: they would hold the kink in
-its place."""
+its point."""
 
 KINK_WINDOW = 0.04
 """Distance along the path from a kink within which its height is measured."""
@@ -61,7 +61,7 @@ class DistanceConstraintKind(ConstraintKind[PathRow]):
     """Kind of constraint on the distance of a pair of bodies.
 
     Attributes:
-        window: number of places on both sides of a row's place over which the least distance is
+        window: number of points on both sides of a row's point over which the least distance is
             measured.
         wanted: (n_pairs,) distance that programs require of each pair [m].
         least: (n_pairs,) distance below which a pair violates the constraint [m].
@@ -87,22 +87,22 @@ class DistanceConstraintKind(ConstraintKind[PathRow]):
         (scalar inequality): the wanted distance minus the model's error.
 
         The error is the measured least distance minus the value of the smooth model at the row's
-        place. The distance is measured at this place and at up to `window` places on each side. A
-        row at a place that an arm does not reach gets the small value `PATCH_MARGIN`.
+        point. The distance is measured at this point and at up to `window` points on each side. A
+        row at a point that an arm does not reach gets the small value `PATCH_MARGIN`.
 
         Args:
-            carry: the candidate, evaluated at places of the path.
+            carry: the candidate, evaluated at points of the path.
             rows: the rows.
             is_relaxed: True to require no larger distance than the candidate has, if its distance
                 is positive.
         """
         values = np.full(len(rows), PATCH_MARGIN)
-        chosen = [k for k, row in enumerate(rows) if row.place < carry.reached]
+        chosen = [k for k, row in enumerate(rows) if row.point < carry.reached]
         if not chosen:
             return values.tolist()
         # The least distance in the window of each row.
         pairs, window = [pair_of(rows[k]) for k in chosen], self.window
-        at = [slice(max(0, rows[k].place - window), rows[k].place + window + 1) for k in chosen]
+        at = [slice(max(0, rows[k].point - window), rows[k].point + window + 1) for k in chosen]
         stretches = list(zip(at, pairs, strict=True))
         truth = np.array(carry.distances.least(stretches, MEASURED_BELOW))
         wanted = self.wanted[pairs]
@@ -121,7 +121,7 @@ def pair_of(row: PathRow) -> int:
 
 class Clearances(DistanceConstraintKind):
     """Rows (scalar inequalities) on the distances of pairs of bodies that include a body of an arm,
-    at the places of least distance.
+    at the points of least distance.
     """
 
     persists = True
@@ -131,116 +131,116 @@ class Clearances(DistanceConstraintKind):
         `BODY_DISTANCE`, at the local minima of a lower bound of their distance along the path.
 
         Args:
-            carry: the candidate, evaluated at places of the path.
+            carry: the candidate, evaluated at points of the path.
             limits: not used.
         """
         for pair in np.flatnonzero(carry.distances.bounds.min(axis=0) < BODY_DISTANCE).tolist():
             if pair not in self.separable:
-                for place in local_minima_below(carry.distances.bounds[:, pair], BODY_DISTANCE):
-                    yield PathRow(Clearance(pair, self._columns[pair]), place)
+                for point in local_minima_below(carry.distances.bounds[:, pair], BODY_DISTANCE):
+                    yield PathRow(Clearance(pair, self._columns[pair]), point)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
         """Return rows (scalar inequalities) for pairs of bodies that are too close.
 
         Around each local minimum of a distance below its limit, rows lie at the minimum, at the
-        next place, and `BESIDE_CLEARANCE` before and after it along the path.
+        next point, and `BESIDE_CLEARANCE` before and after it along the path.
 
         Args:
             carry: candidate after the step.
             known: candidate before the step; not used.
         """
-        width = self.grid.places(BESIDE_CLEARANCE)
+        width = self.grid.points(BESIDE_CLEARANCE)
         for pair, distance in carry.distances.closer_than(self.least).items():
             if pair in self.separable:
                 continue
             lows = local_minima_below(distance, float(self.least[pair]))
-            for place in sorted({k + beside for k in lows for beside in (0, 1, -width, width)}):
-                if place < carry.reached:
-                    yield PathRow(Clearance(pair, self._columns[pair]), place)
+            for point in sorted({k + beside for k in lows for beside in (0, 1, -width, width)}):
+                if point < carry.reached:
+                    yield PathRow(Clearance(pair, self._columns[pair]), point)
 
 
 class SeparatingAxisGaps(DistanceConstraintKind):
     """Rows (scalar inequalities) on the gap between payload and an obstacle box along one
     direction.
 
-    They lie away from kinks, the places at which the direction of the largest gap changes.
+    They lie away from kinks, the points at which the direction of the largest gap changes.
     """
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
         """Return rows (scalar inequalities) at regular distances along every part of the path on
         which the payload is near an obstacle box.
 
-        No row lies closer than `BESIDE_KINK` to a kink, a place at which the direction of the
+        No row lies closer than `BESIDE_KINK` to a kink, a point at which the direction of the
         largest gap changes.
 
         Args:
-            carry: the candidate, evaluated at places of the path.
+            carry: the candidate, evaluated at points of the path.
             limits: not used.
         """
         grid = self.grid
-        beside = grid.places(BESIDE_KINK)
+        beside = grid.points(BESIDE_KINK)
         stretches = (
-            (GAP_DISTANCE, grid.places(GAP_STRIDE)),
-            (FAR_GAP_DISTANCE, grid.places(FAR_GAP_STRIDE)),
+            (GAP_DISTANCE, grid.points(GAP_STRIDE)),
+            (FAR_GAP_DISTANCE, grid.points(FAR_GAP_STRIDE)),
         )
         for pair, gaps in near_gaps(self, carry):
             kinks = [kink for kink, _ in edges(gaps, KINK_DISTANCE)]
-            places = {
-                place
+            points = {
+                point
                 for distance, stride in stretches
-                for place in local_minima_below(gaps.height, distance, stride)
-                if all(abs(place - kink) >= beside for kink in kinks)
+                for point in local_minima_below(gaps.height, distance, stride)
+                if all(abs(point - kink) >= beside for kink in kinks)
             }
-            for place in sorted(places):
-                yield separation(pair, gaps, place)
+            for point in sorted(points):
+                yield separation(pair, gaps, point)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
         """Return rows (scalar inequalities) where the payload comes too close to an obstacle box
-        after a step: at the place of the least distance, and half of `KINK_WINDOW` before and after
+        after a step: at the point of the least distance, and half of `KINK_WINDOW` before and after
         it along the path.
 
         Each row limits the gap along the direction in which the gap was largest before the step.
-        Places near a kink, where this direction changes, are left to `AxisSwitchGaps`.
+        Points near a kink, where this direction changes, are left to `AxisSwitchGaps`.
 
         Args:
             carry: candidate after the step.
             known: candidate before the step.
         """
-        half = self.grid.places(KINK_WINDOW) // 2
-        for pair, gaps, place, near in violated_passages(self, carry, known):
+        half = self.grid.points(KINK_WINDOW) // 2
+        for pair, gaps, point, near in violated_passages(self, carry, known):
             if not near:
-                for k in (place - half, place, place + half):
+                for k in (point - half, point, point + half):
                     if 0 <= k < known.reached:
                         yield separation(pair, gaps, k)
 
 
 class AxisSwitchGaps(DistanceConstraintKind):
-    """Rows (scalar inequalities) on the gap at a kink, the place at which the payload passes an
+    """Rows (scalar inequalities) on the gap at a kink, the point at which the payload passes an
     edge of a box.
     """
 
     def __init__(self, cell: SmoothCell) -> None:
         super().__init__(cell)
-        self.window = cell.grid.places(KINK_WINDOW)
+        self.window = cell.grid.points(KINK_WINDOW)
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
         """Return a row (scalar inequality) for each kink whose gap is below `KINK_DISTANCE`.
 
-        A kink is a place of the path at which the payload passes an edge of an obstacle box.
+        A kink is a point of the path at which the payload passes an edge of an obstacle box.
 
         Args:
-            carry: the candidate, evaluated at places of the path.
+            carry: the candidate, evaluated at points of the path.
             limits: not used.
         """
         for pair, gaps in near_gaps(self, carry):
-            for kink, place in edges(gaps, KINK_DISTANCE):
-                yield passing(pair, gaps, kink, place)
+            for kink, point in edges(gaps, KINK_DISTANCE):
+                yield passing(pair, gaps, kink, point)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
-        """Return a row (scalar inequality) for each kink that lies near a place of the path where
+        """Return a row (scalar inequality) for each kink that lies near a point of the path where
         the payload comes too close to an obstacle box after a step.
 
-        A kink is a place at which the payload passes an edge of the obstacle. The kinks of the
+        A kink is a point at which the payload passes an edge of the obstacle. The kinks of the
         candidate before the step are used.
 
         Args:
@@ -248,13 +248,13 @@ class AxisSwitchGaps(DistanceConstraintKind):
             known: candidate before the step.
         """
         for pair, gaps, _, near in violated_passages(self, carry, known):
-            for kink, place in near:
-                yield passing(pair, gaps, kink, place)
+            for kink, point in near:
+                yield passing(pair, gaps, kink, point)
 
 
 @dataclass(frozen=True)
 class Gaps:
-    """Gaps between the payload and an obstacle box along n directions, at m places of the path.
+    """Gaps between the payload and an obstacle box along n directions, at m points of the path.
 
     Attributes:
         along: (m, n) gap between payload and obstacle along each direction [m].
@@ -268,7 +268,7 @@ class Gaps:
 
     @classmethod
     def from_values(cls, along: Array) -> Gaps:
-        """Build the record from the gaps (m, n) [m] at m places along n directions."""
+        """Build the record from the gaps (m, n) [m] at m points along n directions."""
         best = along.argmax(axis=1)
         return cls(along, best, along[np.arange(len(best)), best])
 
@@ -276,17 +276,17 @@ class Gaps:
 def edges(gaps: Gaps, limit: float) -> list[tuple[int, int]]:
     """Find the kinks of the largest gap along a path.
 
-    A kink lies between two successive places at which different directions have the largest gap.
-    The gap along the first of these directions falls from place to place, that along the second one
+    A kink lies between two successive points at which different directions have the largest gap.
+    The gap along the first of these directions falls from point to point, that along the second one
     rises.
 
     Args:
         gaps: gaps between payload and one obstacle box along the path.
-        limit: kinks are left out if the largest gap reaches this limit [m] at both places.
+        limit: kinks are left out if the largest gap reaches this limit [m] at both points.
 
     Returns:
-        For each kink the index of the place before it, and the index of that one of the two places
-        with the smaller value of the largest gap.
+        For each kink the index of the point before it, and the index of that one of these two
+        points with the smaller value of the largest gap.
     """
     best, height, along = gaps.best, gaps.height, gaps.along
     return [
@@ -298,30 +298,30 @@ def edges(gaps: Gaps, limit: float) -> list[tuple[int, int]]:
     ]
 
 
-def passing(pair: int, gaps: Gaps, kink: int, place: int) -> PathRow:
+def passing(pair: int, gaps: Gaps, kink: int, point: int) -> PathRow:
     """Return the row (scalar inequality) for a kink: the payload passes an edge of an obstacle box,
     and the direction of the largest gap changes.
 
     Args:
         pair: index of the pair of payload and obstacle.
         gaps: gaps of the pair along the path.
-        kink: index of the place before the kink.
-        place: index of the place at which the row applies.
+        kink: index of the point before the kink.
+        point: index of the point at which the row applies.
     """
     before, after = (int(gaps.best[k]) for k in (kink, kink + 1))
-    return PathRow(AxisSwitchGap(pair, before, after), place)
+    return PathRow(AxisSwitchGap(pair, before, after), point)
 
 
-def separation(pair: int, gaps: Gaps, place: int) -> PathRow:
+def separation(pair: int, gaps: Gaps, point: int) -> PathRow:
     """Return the row (scalar inequality) for the largest gap between payload and obstacle at a
-    place.
+    point.
 
     Args:
         pair: index of the pair of payload and obstacle.
         gaps: gaps of the pair along the path.
-        place: index of the place of the row.
+        point: index of the point of the row.
     """
-    return PathRow(SeparatingAxisGap(pair, int(gaps.best[place])), place)
+    return PathRow(SeparatingAxisGap(pair, int(gaps.best[point])), point)
 
 
 def near_gaps(kind: DistanceConstraintKind, carry: PlacedCarry) -> Iterable[tuple[int, Gaps]]:
@@ -330,7 +330,7 @@ def near_gaps(kind: DistanceConstraintKind, carry: PlacedCarry) -> Iterable[tupl
 
     Args:
         kind: kind of constraint, which knows the separable pairs.
-        carry: the candidate, evaluated at places of the path.
+        carry: the candidate, evaluated at points of the path.
 
     Yields:
         Index of the pair, and its gaps.
@@ -343,7 +343,7 @@ def near_gaps(kind: DistanceConstraintKind, carry: PlacedCarry) -> Iterable[tupl
 def violated_passages(
     kind: DistanceConstraintKind, carry: PlacedCarry, known: PlacedCarry
 ) -> Iterable[tuple[int, Gaps, int, list[tuple[int, int]]]]:
-    """Find the places at which the payload comes too close to a box-shaped obstacle after a step.
+    """Find the points at which the payload comes too close to a box-shaped obstacle after a step.
 
     Args:
         kind: kind of constraint, which knows the pairs of payload and obstacle box and their least
@@ -352,15 +352,15 @@ def violated_passages(
         known: candidate before the step.
 
     Yields:
-        Index of the pair; its gaps before the step; index of a place with a local minimum of the
-        distance below its limit; and the kinks (index of the place before the kink, index of the
-        place with the smaller gap) that lie near this place, before the step.
+        Index of the pair; its gaps before the step; index of a point with a local minimum of the
+        distance below its limit; and the kinks (index of the point before the kink, index of the
+        point with the smaller gap) that lie near this point, before the step.
     """
-    window = kind.grid.places(KINK_WINDOW)
+    window = kind.grid.points(KINK_WINDOW)
     for pair, distance in carry.distances.closer_than(kind.least).items():
         if pair not in kind.separable:
             continue
         gaps = Gaps.from_values(known.gaps(pair))
         kinks = edges(gaps, KINK_DISTANCE)
-        for place in local_minima_below(distance, float(kind.least[pair])):
-            yield pair, gaps, place, [k for k in kinks if abs(k[1] - place) <= window]
+        for point in local_minima_below(distance, float(kind.least[pair])):
+            yield pair, gaps, point, [k for k in kinks if abs(k[1] - point) <= window]

@@ -17,14 +17,14 @@ from hybrid_opt.polishing.cell import SmoothCell
 from hybrid_opt.polishing.rows import PROGRAM_BRANCH, ForceRow, PathRow, PressureRow, row_numbers
 from symbolic.array import Array
 from symbolic.contact.registry import contact_model
-from symbolic.smooth.places import JointLimit, ManipulabilityLimit, Side
+from symbolic.smooth.path_points import JointLimit, ManipulabilityLimit, Side
 
 PATCH_MARGIN = 1e-6
 """Margin to the rim of a patch, in the square of shift over radius."""
 
 SAMPLING_MARGIN = 2e-3
 """Margin to joint limits [rad], and to singularities in the square of |det J| over its least
-allowed value. It covers the path between places."""
+allowed value. It covers the path between points."""
 
 CONE_TIGHT = 0
 """Index of the branch of the normal force with tight friction cones. It governs unless the lateral
@@ -60,7 +60,7 @@ SINGULAR_RATIO, SINGULAR_STRIDE = 1.1, 0.005
 stride."""
 
 LOST_ARM_STRIDE = 0.04
-"""If an arm loses the path, rows follow this place at this distance and at twice this distance."""
+"""If an arm loses the path, rows follow this point at this distance and at twice this distance."""
 
 MinimisedForces = tuple[bool, bool]
 """For each robot, True if its force is minimised, False if it is only used to break ties."""
@@ -74,7 +74,7 @@ class ConstraintKind(ABC, Generic[AnyRow]):
 
     Attributes:
         cell: shared data of the polish of a workcell.
-        grid: places along the path.
+        grid: points along the path.
         persists: True if tightened bounds stay valid at other candidates. If False, they are
             relative to the candidate at which they were measured.
     """
@@ -90,7 +90,7 @@ class ConstraintKind(ABC, Generic[AnyRow]):
         candidate.
 
         Args:
-            carry: the candidate, evaluated at places of the path.
+            carry: the candidate, evaluated at points of the path.
             limits: for each robot, True if its normal force is minimised.
         """
 
@@ -110,7 +110,7 @@ class ConstraintKind(ABC, Generic[AnyRow]):
         problem of a step.
 
         Args:
-            carry: the candidate from which the step starts, evaluated at places of the path.
+            carry: the candidate from which the step starts, evaluated at points of the path.
             rows: the rows.
             is_relaxed: True to require no larger distance between bodies than the candidate has.
         """
@@ -160,7 +160,7 @@ class Forces(ConstraintKind[ForceRow]):
         fewer samples.
 
         Args:
-            carry: the candidate, evaluated at places of the path.
+            carry: the candidate, evaluated at points of the path.
             limits: for each robot, True if its normal force is minimised.
         """
         samples = self._every | self._ends | self._peaks(carry)
@@ -189,7 +189,7 @@ class Forces(ConstraintKind[ForceRow]):
         A program without these rows underestimates the peak forces.
 
         Args:
-            carry: the candidate, evaluated at places of the path.
+            carry: the candidate, evaluated at points of the path.
             limits: for each robot, True if its normal force is minimised.
         """
         return {
@@ -204,7 +204,7 @@ class Forces(ConstraintKind[ForceRow]):
         force.
 
         Args:
-            carry: the candidate, evaluated at places of the path.
+            carry: the candidate, evaluated at points of the path.
 
         Returns:
             (samples, 2, branches) values for both robots [N].
@@ -231,7 +231,7 @@ class Forces(ConstraintKind[ForceRow]):
         forces that a convex program computes have no branches; for them the list is empty.
 
         Args:
-            carry: the candidate, evaluated at places of the path.
+            carry: the candidate, evaluated at points of the path.
 
         Returns:
             One row for each such branch, robot and sample.
@@ -261,7 +261,7 @@ class Pressure(ConstraintKind[PressureRow]):
         shift above the share `PRESSURE_SHARE` of the patch radius.
 
         Args:
-            carry: the candidate, evaluated at places of the path.
+            carry: the candidate, evaluated at points of the path.
             limits: not used.
         """
         return self._beyond(carry, PRESSURE_SHARE)
@@ -299,7 +299,7 @@ class JointLimits(ConstraintKind[PathRow]):
         `JOINT_DISTANCE`.
 
         Args:
-            carry: the candidate, evaluated at places of the path.
+            carry: the candidate, evaluated at points of the path.
             limits: not used.
         """
         return self._below(carry, JOINT_DISTANCE)
@@ -320,7 +320,7 @@ class JointLimits(ConstraintKind[PathRow]):
         """Return the required distance to the joint limit for every row (scalar inequality):
         `SAMPLING_MARGIN` [rad].
 
-        This distance covers the path between places.
+        This distance covers the path between points.
 
         Args:
             carry: not used.
@@ -338,8 +338,8 @@ class JointLimits(ConstraintKind[PathRow]):
             )
             for side, margin in margins:
                 for joint in range(q.shape[1]):
-                    for place in local_minima_below(margin[:, joint], limit):
-                        yield PathRow(JointLimit(arm, joint, side), place)
+                    for point in local_minima_below(margin[:, joint], limit):
+                        yield PathRow(JointLimit(arm, joint, side), point)
 
 
 class ManipulabilityLimits(ConstraintKind[PathRow]):
@@ -361,23 +361,23 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
         two of them.
 
         Args:
-            carry: the candidate, evaluated at places of the path.
+            carry: the candidate, evaluated at points of the path.
             limits: not used.
         """
-        places = self.grid.places
+        points = self.grid.points
         for arm in (0, 1):
             measure = carry.manipulability[:, arm]
             least = max(1.0, MANIPULABILITY_SHARE * float(np.median(measure)))
-            chosen = {*local_minima_below(measure, least, places(MANIPULABILITY_STRIDE))}
-            chosen |= {*local_minima_below(measure, SINGULAR_RATIO, places(SINGULAR_STRIDE))}
-            for place in sorted(chosen):
-                yield PathRow(ManipulabilityLimit(arm), place)
+            chosen = {*local_minima_below(measure, least, points(MANIPULABILITY_STRIDE))}
+            chosen |= {*local_minima_below(measure, SINGULAR_RATIO, points(SINGULAR_STRIDE))}
+            for point in sorted(chosen):
+                yield PathRow(ManipulabilityLimit(arm), point)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
         """Return rows (scalar inequalities) where ``|det J|`` of an arm's Jacobian J is below its
         least allowed value plus half of the margin.
 
-        For an arm that does not reach all places, rows at the first unreachable place and at two
+        For an arm that does not reach all points, rows at the first unreachable point and at two
         later ones are added: there the arm is stretched out and so singular.
 
         Args:
@@ -386,10 +386,10 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
         """
         least = (1.0 + SAMPLING_MARGIN / 2.0) ** 0.5
         for arm in (0, 1):
-            for place in local_minima_below(carry.manipulability[:, arm], least):
-                yield PathRow(ManipulabilityLimit(arm), place)
+            for point in local_minima_below(carry.manipulability[:, arm], least):
+                yield PathRow(ManipulabilityLimit(arm), point)
         for arm in carry.unreachable_arms:
-            width = self.grid.places(LOST_ARM_STRIDE)
+            width = self.grid.points(LOST_ARM_STRIDE)
             for later in (0, width, 2 * width):
                 yield PathRow(ManipulabilityLimit(arm), carry.reached + later)
 
@@ -399,7 +399,7 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
         """Return the required value of every row (scalar inequality): `SAMPLING_MARGIN`.
 
         A row's value is the square of ``|det J|`` over its least allowed value, minus one. The
-        margin covers the path between places.
+        margin covers the path between points.
 
         Args:
             carry: not used.
@@ -413,7 +413,7 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
     ) -> list[float]:
         """Return the new bound of each row (scalar inequality) that a step violated.
 
-        If both arms reach all places after the step, the bound is `SAMPLING_MARGIN`. Otherwise it
+        If both arms reach all points after the step, the bound is `SAMPLING_MARGIN`. Otherwise it
         is the mean of two values: the row's bound in the last program, and the value of its left
         side at the candidate before the step.
 
@@ -434,8 +434,8 @@ def smooth_values(cell: SmoothCell, carry: PlacedCarry, rows: Sequence[PathRow])
 
     Args:
         cell: shared data of the polish.
-        carry: the candidate, evaluated at places of the path.
-        rows: n rows at places that both arms reach.
+        carry: the candidate, evaluated at points of the path.
+        rows: n rows at points that both arms reach.
 
     Returns:
         (n,) values in the units of their constraints [m, rad or none].
@@ -445,7 +445,7 @@ def smooth_values(cell: SmoothCell, carry: PlacedCarry, rows: Sequence[PathRow])
     for k, row in enumerate(rows):
         groups.setdefault(functions.row(row.constraint, "first"), []).append(k)
     for function, members in groups.items():
-        at = [rows[k].place for k in members]
+        at = [rows[k].point for k in members]
         inputs = [array[at] for array in (carry.pose, carry.rate, *carry.q)]
         inputs += row_numbers([rows[k].constraint for k in members], functions)
         values[members] = function.batch(*inputs)["value"]

@@ -1,4 +1,4 @@
-"""A candidate on places as if all had been measured, and what programs of a cell share."""
+"""A candidate on points as if all had been measured, and what programs of a cell share."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from hybrid_opt.polishing.carry import (
     interpolate_minima,
     local_minima_below,
 )
-from hybrid_opt.polishing.cell import PLACE_SPACING, Grid, PolishFunctions
+from hybrid_opt.polishing.cell import POINT_SPACING, Grid, PolishFunctions
 from hybrid_opt.polishing.constraints.active import RowSelector
 from symbolic.array import Array
 from symbolic.records.task import initial_decision
-from symbolic.smooth.places import ORDERS, Clearance, PathPointSymbols, row_function
+from symbolic.smooth.path_points import ORDERS, Clearance, PathPointSymbols, row_function
 from tests.hybrid_opt.polishing.cells import smooth_cell
 from tests.hybrid_opt.polishing.test_force_front import evaluator
 from tests.symbolic.cells import hand_cell, rack_cell
@@ -101,7 +101,7 @@ def test_a_step_violates_something_where_violated_rows_say_so(spread: float) -> 
 
 
 @given(st.integers(1, 40), st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=60))
-def test_strided_places_are_below_the_limit_and_hold_the_lowest(
+def test_strided_points_are_below_the_limit_and_hold_the_lowest(
     stride: int, values: list[float]
 ) -> None:
     array = np.array(values)
@@ -113,7 +113,7 @@ def test_strided_places_are_below_the_limit_and_hold_the_lowest(
         assert array[least].min() == array.min()
 
 
-def test_the_dip_between_two_places_is_that_of_the_lines_from_both_sides() -> None:
+def test_the_dip_between_two_points_is_that_of_the_lines_from_both_sides() -> None:
     height = 0.001 + 3e-3 * np.abs(np.arange(120) - 50.4)
     low = interpolate_minima(height[:, None])[:, 0]
     np.testing.assert_allclose(low[50:52], 0.001, atol=1e-12)
@@ -157,8 +157,8 @@ def test_widths_do_not_depend_on_the_number_of_samples(samples: int) -> None:
     grid = Grid(replace(cell.task, samples=samples))
     spacing = grid.parameter[1]
     numbers = np.arange(1, 50)
-    nearest = numbers[np.argmin(np.abs(numbers * (samples - 1) - 1.0 / PLACE_SPACING))]
+    nearest = numbers[np.argmin(np.abs(numbers * (samples - 1) - 1.0 / POINT_SPACING))]
     assert grid.per_sample == nearest
     for width in (0.015, 0.04, 0.08):
-        assert grid.places(width) * spacing == pytest.approx(width, abs=spacing)
+        assert grid.points(width) * spacing == pytest.approx(width, abs=spacing)
     np.testing.assert_allclose(grid.parameter[:: grid.per_sample], grid.sample_parameter)

@@ -27,7 +27,7 @@ from hybrid_opt.polishing.rows import PathRow, Row
 from hybrid_opt.polishing.solvers.base import UNKNOWN
 from symbolic.array import Array
 from symbolic.smooth.passage import AxisSwitchGap, SeparatingAxisGap
-from symbolic.smooth.places import Clearance
+from symbolic.smooth.path_points import Clearance
 
 LEAST = 1e-3
 
@@ -173,7 +173,7 @@ PLACES, LOW = 120, 0.06
 
 
 def v_shape(kink: float, height: float, slope: float = 3e-3) -> Gaps:
-    """Two gaps that cross at a place: one falls, the other rises."""
+    """Two gaps that cross at a point: one falls, the other rises."""
     away = np.arange(PLACES) - kink
     return Gaps.from_values(np.column_stack([height - slope * away, height + slope * away]))
 
@@ -181,11 +181,11 @@ def v_shape(kink: float, height: float, slope: float = 3e-3) -> Gaps:
 @given(kink=st.floats(20.0, 100.0), height=st.floats(-0.02, LOW - 0.01))
 def test_where_an_edge_is_passed_there_is_one_kink(kink: float, height: float) -> None:
     gaps = v_shape(kink, height)
-    ((before, place),) = edges(gaps, LOW)
-    assert abs(place - kink) <= 1.0
+    ((before, point),) = edges(gaps, LOW)
+    assert abs(point - kink) <= 1.0
     assert before <= kink <= before + 1
-    row = passing(7, gaps, before, place)
-    assert row == PathRow(AxisSwitchGap(7, 0, 1), place)
+    row = passing(7, gaps, before, point)
+    assert row == PathRow(AxisSwitchGap(7, 0, 1), point)
 
 
 def test_a_separation_is_of_the_largest_gap() -> None:

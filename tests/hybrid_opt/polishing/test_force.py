@@ -29,7 +29,7 @@ from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.records.task import initial_decision
 from symbolic.smooth.passage import AxisSwitchGap, SeparatingAxisGap
-from symbolic.smooth.places import (
+from symbolic.smooth.path_points import (
     Clearance,
     JointLimit,
     ManipulabilityLimit,
@@ -106,7 +106,7 @@ def program_of(judge: CandidateEvaluator) -> tuple[ForceProgram, Array]:
         ManipulabilityLimit(1),
     ]
     kinds += [JointLimit(0, 2, "lower"), JointLimit(1, 4, "upper")]
-    rows += [PathRow(kind, place) for kind in kinds for place in (44, 120, 222)]
+    rows += [PathRow(kind, point) for kind in kinds for point in (44, 120, 222)]
     program = ForceProgram(cell, dict.fromkeys(rows, 0.01), TARGET, carry, x, 1.0)
     z = program.start.copy()
     z[: task.n_var] += np.random.default_rng(0).uniform(-0.05, 0.05, task.n_var)
@@ -137,9 +137,9 @@ def test_a_whole_turn_more_is_none(path: Path) -> None:
     program, z = made(path)
     task, turned = evaluator(path).workcell.task, z.copy()
     turned[5] += 4.0 * np.pi / (task.upper[5] - task.lower[5])
-    places = program.layout.places
-    values = program.rows(z)[0][places].copy()
-    np.testing.assert_allclose(program.rows(turned)[0][places], values, atol=1e-9)
+    points = program.layout.points
+    values = program.rows(z)[0][points].copy()
+    np.testing.assert_allclose(program.rows(turned)[0][points], values, atol=1e-9)
 
 
 def require_jacobian(program: ForceProgram, z: Array) -> None:
@@ -264,7 +264,7 @@ def test_settings_are_the_same_after_json() -> None:
     assert json.loads(json.dumps(settings)) == settings
 
 
-def written(constraint: PathConstraint, place: int, x: Array, near: tuple[Array, Array]) -> Array:
+def written(constraint: PathConstraint, point: int, x: Array, near: tuple[Array, Array]) -> Array:
     """A row's value, then its gradient by the decision vector: CasADi's functions one by one,
     joints following the box by the implicit function.
 
@@ -274,7 +274,7 @@ def written(constraint: PathConstraint, place: int, x: Array, near: tuple[Array,
     cell, model = smooth_cell(evaluator(RACK)), evaluator(RACK).compiled.model
     front_attempts, symbols = cell.waypoints(x), PathPointSymbols(model)
     pose, rate = (
-        basis[place] @ front_attempts for basis in (cell.grid.basis, cell.grid.rate_basis)
+        basis[point] @ front_attempts for basis in (cell.grid.basis, cell.grid.rate_basis)
     )
     joints, follow = [], []
     for arm in (0, 1):
@@ -293,8 +293,8 @@ def written(constraint: PathConstraint, place: int, x: Array, near: tuple[Array,
         by_pose += follow[arm].T @ slope[at : at + 6]
         at += 6
     rows, columns = cell.free
-    by_x = cell.grid.basis[place][rows] * by_pose[columns]
-    by_x += cell.grid.rate_basis[place][rows] * by_rate[columns]
+    by_x = cell.grid.basis[point][rows] * by_pose[columns]
+    by_x += cell.grid.rate_basis[point][rows] * by_rate[columns]
     return np.append(float(ca.DM(value)), by_x) / constraint.scale
 
 
@@ -311,13 +311,13 @@ def test_values_and_slopes_are_those_of_the_expressions() -> None:
         JointLimit(0, 2, "lower"),
     ]
     kinds += [JointLimit(1, 4, "upper"), SeparatingAxisGap(box, 3), AxisSwitchGap(box, 5, 0)]
-    listed: list[Row] = [PathRow(kind, place) for kind in kinds for place in (60, 150)]
+    listed: list[Row] = [PathRow(kind, point) for kind in kinds for point in (60, 150)]
     layout = RowLayout(listed)
     rows = ConstraintRows(cell, layout, carry.q)
     x = x + np.random.default_rng(0).uniform(-0.02, 0.02, len(x))
     values, slopes = rows.values(x), rows.slopes()
-    for k, row in enumerate(layout.place_rows):
-        near = carry.q[0][row.place], carry.q[1][row.place]
-        wanted = written(row.constraint, row.place, x, near)
+    for k, row in enumerate(layout.point_rows):
+        near = carry.q[0][row.point], carry.q[1][row.point]
+        wanted = written(row.constraint, row.point, x, near)
         found = np.append(values[k], slopes[k])
         np.testing.assert_allclose(found, wanted, rtol=1e-8, atol=1e-8)

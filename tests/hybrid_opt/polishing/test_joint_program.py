@@ -20,7 +20,7 @@ from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.timing.model import TimingModel
 from symbolic.array import Array
 from symbolic.records.task import initial_decision
-from symbolic.smooth.places import ManipulabilityLimit
+from symbolic.smooth.path_points import ManipulabilityLimit
 from tests.hybrid_opt.polishing.cells import (
     disbelieved,
     drivable_rack,

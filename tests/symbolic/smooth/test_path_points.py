@@ -1,4 +1,4 @@
-"""Rows at places and samples of the polish's program against the functions they come from."""
+"""Rows at points and samples of the polish's program against the functions they come from."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from symbolic.smooth.passage import (
     SeparatingAxisGap,
     gap_function,
 )
-from symbolic.smooth.places import (
+from symbolic.smooth.path_points import (
     PARALLEL_WIDTH,
     Clearance,
     JointLimit,
@@ -55,23 +55,23 @@ STILL = np.zeros(6)
 
 
 @cache
-def place() -> PathPointSymbols:
+def point() -> PathPointSymbols:
     return PathPointSymbols(rack_model())
 
 
 def value_of(constraint: PathConstraint, *at: Array) -> float:
     """A row's value at pose, rate and joints."""
-    numbers = [constraint.numbers(place())] if constraint.count(place()) else []
-    return float(row_function(place(), constraint, "first")(*at, *numbers)[0])
+    numbers = [constraint.numbers(point())] if constraint.count(point()) else []
+    return float(row_function(point(), constraint, "first")(*at, *numbers)[0])
 
 
 @cache
 def gaps_of_poses() -> ca.Function:
-    return gap_function(place())
+    return gap_function(point())
 
 
 def gaps_at(index: int, pose: Array) -> Array:
-    return np.array(gaps_of_poses()(pose, place().obstacle(index))).ravel()
+    return np.array(gaps_of_poses()(pose, point().obstacle(index))).ravel()
 
 
 def pose_near_start(seed: int) -> Array:
@@ -110,7 +110,7 @@ def test_clearances_lie_about_the_sharp_bound() -> None:
     placements = (rack_model().robots[0].joint_placements, rack_model().robots[1].joint_placements)
     sharp = screening_functions(rack_model().geometry, placements)["clearance"]
     names, columns = rack_model().geometry.pair_names, rack_model().geometry.columns
-    assert {"top board", "pallet in front"} <= {names[index][1] for index in place().separable()}
+    assert {"top board", "pallet in front"} <= {names[index][1] for index in point().separable()}
     for seed in range(3):
         pose = pose_near_start(seed)
         q = joints_at(pose)
@@ -118,7 +118,7 @@ def test_clearances_lie_about_the_sharp_bound() -> None:
         for index in range(0, len(bounds), 7):
             smooth = value_of(Clearance(0, index), pose, STILL, *q)
             assert bounds[index] - 0.1 <= smooth <= bounds[index] + 1e-12
-        for index in place().separable():
+        for index in point().separable():
             gaps = gaps_at(index, pose)
             assert len(gaps) == SEPARATING_DIRECTIONS
             assert bounds[columns[index]] <= gaps.max() + 1e-12
@@ -134,7 +134,7 @@ def test_one_direction_separates_boxes_that_are_apart(
 ) -> None:
     """Against Coal, near an edge of an obstacle: the largest gap is positive where they are apart,
     and never more than their distance then."""
-    index = place().separable()[chosen % len(place().separable())]
+    index = point().separable()[chosen % len(point().separable())]
     obstacle = rack_model().geometry.bodies[rack_model().geometry.active[index].second].pieces[0]
     assert isinstance(obstacle.shape, Box)
     half = np.asarray(obstacle.shape.size) / 2.0
@@ -157,7 +157,7 @@ def test_a_row_of_a_gap_falls_short_of_it_by_what_its_kinks_are_rounded() -> Non
     workcell = rack_model().workcell
     sizes = {b.name: b.shape.size for b in workcell.environment if isinstance(b.shape, Box)}
     pose = pose_near_start(1)
-    for index in place().separable():
+    for index in point().separable():
         size = sizes[rack_model().geometry.pair_names[index][1]]
         # Each rounded kink of a rotation's entry takes TURN of half an edge at most.
         rounded = PARALLEL_WIDTH * (workcell.payload.size.sum() + size.sum()) / 2.0
@@ -170,7 +170,7 @@ def test_a_row_of_a_gap_falls_short_of_it_by_what_its_kinks_are_rounded() -> Non
 
 def test_a_passing_row_is_the_height_at_which_the_gaps_meet() -> None:
     index = next(
-        k for k in place().separable() if rack_model().geometry.pair_names[k][1] == "top board"
+        k for k in point().separable() if rack_model().geometry.pair_names[k][1] == "top board"
     )
     pose = np.array([-0.34, 0.01, 0.86, 0.01, 0.05, 0.02])
     rate = np.array([-2e-3, 1e-4, 2e-3, 1e-4, -2e-4, 1e-4])

@@ -1,6 +1,6 @@
-"""Rows at places of the path: their constraints, and joints that follow the box.
+"""Rows at points of the path: their constraints, and joints that follow the box.
 
-A row is a value that has to exceed a required value. The value depends on the box pose at the place
+A row is a value that has to exceed a required value. The value depends on the box pose at the point
 and on the joints that hold the box; where the separating direction changes
 (`symbolic.smooth.passage`) also on the rate of the pose along the path. With the closure F(pose, q)
 = 0, the joints follow the pose by the implicit function theorem, and a row c(pose, q) has the
@@ -58,7 +58,7 @@ carries lie in these kinks, and a solver makes little progress along sharp ones.
 
 
 class PathPointSymbols:
-    """Symbols of pose and joints at one place of the path, and expressions that are built from them
+    """Symbols of pose and joints at one point of the path, and expressions that are built from them
     once.
 
     Attributes:
@@ -109,7 +109,7 @@ class PathPointSymbols:
 
 @dataclass(frozen=True)
 class PathConstraint(ABC):
-    """Constraint at one place of the path: a value that must exceed a required value.
+    """Constraint at one point of the path: a value that must exceed a required value.
 
     Constraints of one family share their compiled functions and differ only by the parameters of
     these functions.
@@ -131,20 +131,20 @@ class PathConstraint(ABC):
         """
 
     @abstractmethod
-    def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
+    def expression(self, point: PathPointSymbols, numbers: ca.SX) -> ca.SX:
         """Build the expression of the constrained value [m, rad or 1], a scalar.
 
         Args:
-            place: symbols of the box pose and the joints at one point of the path.
+            point: symbols of the box pose and the joints at one point of the path.
             numbers: (count,) symbols of the parameters that distinguish the constraints of the
                 family.
         """
 
-    def count(self, place: PathPointSymbols) -> int:
+    def count(self, point: PathPointSymbols) -> int:
         """Return the number of parameters of each constraint of the family."""
         return 0
 
-    def numbers(self, place: PathPointSymbols) -> Array:
+    def numbers(self, point: PathPointSymbols) -> Array:
         """Return the values (count,) of the parameters that distinguish this constraint in its
         family."""
         return np.zeros(0)
@@ -179,14 +179,14 @@ class Clearance(PathConstraint):
         """Name of the constraint's family, which contains only this pair of bodies."""
         return f"clearance_{self.column}"
 
-    def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
+    def expression(self, point: PathPointSymbols, numbers: ca.SX) -> ca.SX:
         """Build the expression of the lower bound of the distance of the two bodies [m].
 
         Args:
-            place: symbols of the box pose and the joints at one point of the path.
+            point: symbols of the box pose and the joints at one point of the path.
             numbers: empty.
         """
-        return place.scene.bound(self.column)
+        return point.scene.bound(self.column)
 
     def arms(self, model: CellBodies) -> tuple[int, ...]:
         """Return the indices of the arms that have a link in the pair."""
@@ -218,24 +218,24 @@ class JointLimit(PathConstraint):
         """Name of the constraint's family: all joint limits of one arm."""
         return f"joint_limit_{self.arm + 1}"
 
-    def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
+    def expression(self, point: PathPointSymbols, numbers: ca.SX) -> ca.SX:
         """Build the expression of the distance to the limit [rad or m], negative beyond the limit.
 
         Args:
-            place: symbols of the box pose and the joints at one point of the path.
+            point: symbols of the box pose and the joints at one point of the path.
             numbers: (count,) distance at zero joint positions, then its derivatives by the joints.
         """
-        return numbers[0] + ca.dot(numbers[1:], place.q[self.arm])
+        return numbers[0] + ca.dot(numbers[1:], point.q[self.arm])
 
-    def count(self, place: PathPointSymbols) -> int:
+    def count(self, point: PathPointSymbols) -> int:
         """Return the number of parameters: the distance at zero joint positions, and one slope per
         joint."""
-        return 1 + int(place.q[self.arm].numel())
+        return 1 + int(point.q[self.arm].numel())
 
-    def numbers(self, place: PathPointSymbols) -> Array:
+    def numbers(self, point: PathPointSymbols) -> Array:
         """Return the constraint's parameters (1 + joints,): the distance to the limit at zero joint
         positions, then its derivatives by the arm's joints."""
-        robot = place.model.workcell.robots[self.arm]
+        robot = point.model.workcell.robots[self.arm]
         slope = np.zeros(robot.position_lower.shape[0])
         slope[self.joint] = 1.0 if self.side == "lower" else -1.0
         limit = robot.position_lower if self.side == "lower" else robot.position_upper
@@ -270,17 +270,17 @@ class ManipulabilityLimit(PathConstraint):
         """Name of the constraint's family, whose only member is the limit of this arm."""
         return f"reach_{self.arm + 1}"
 
-    def expression(self, place: PathPointSymbols, numbers: ca.SX) -> ca.SX:
+    def expression(self, point: PathPointSymbols, numbers: ca.SX) -> ca.SX:
         """Build the expression (D / D_min)^2 - 1 of the arm's manipulability D and its least
         allowed value D_min, which the workcell states.
 
         Args:
-            place: symbols of the box pose and the joints at one point of the path.
+            point: symbols of the box pose and the joints at one point of the path.
             numbers: empty.
         """
-        least = place.model.workcell.robots[self.arm].min_manipulability
-        model = place.model.robots[self.arm]
-        jacobian = following_columns(model, model.jacobian(place.q[self.arm]))
+        least = point.model.workcell.robots[self.arm].min_manipulability
+        model = point.model.robots[self.arm]
+        jacobian = following_columns(model, model.jacobian(point.q[self.arm]))
         return (manipulability(jacobian) / least) ** 2 - 1.0
 
     def arms(self, model: CellBodies) -> tuple[int, ...]:
@@ -312,7 +312,7 @@ def closure_name(arm: int, order: Order) -> str:
     return f"closure_{arm + 1}_{order}"
 
 
-def row_function(place: PathPointSymbols, constraint: PathConstraint, order: Order) -> ca.Function:
+def row_function(point: PathPointSymbols, constraint: PathConstraint, order: Order) -> ca.Function:
     """Build the function of a family of constraints and its derivatives at one point of the path.
 
     The variables y (n_y,) of the derivatives are the pose (6,), then its rate (6,) if the
@@ -321,20 +321,20 @@ def row_function(place: PathPointSymbols, constraint: PathConstraint, order: Ord
     the cell's symbolic parameters.
 
     Args:
-        place: symbols of the box pose and the joints at one point of the path.
+        point: symbols of the box pose and the joints at one point of the path.
         constraint: any constraint of the family.
         order: 'first' for the outputs value (scalar) and gradient (n_y,); 'second' for the output
             hessian (n_y, n_y), multiplied by weight.
     """
-    numbers = ca.SX.sym("numbers", constraint.count(place))
-    value = constraint.expression(place, numbers)
-    arms = constraint.arms(place.model)
-    rate = [place.rate] if constraint.moving else []
-    y = ca.vertcat(place.pose, *rate, *[place.q[arm] for arm in arms])
-    inputs = {"pose": place.pose, "rate": place.rate, "q_1": place.q[0], "q_2": place.q[1]}
+    numbers = ca.SX.sym("numbers", constraint.count(point))
+    value = constraint.expression(point, numbers)
+    arms = constraint.arms(point.model)
+    rate = [point.rate] if constraint.moving else []
+    y = ca.vertcat(point.pose, *rate, *[point.q[arm] for arm in arms])
+    inputs = {"pose": point.pose, "rate": point.rate, "q_1": point.q[0], "q_2": point.q[1]}
     if numbers.numel():
         inputs["numbers"] = numbers
-    name, given = row_name(constraint.family, order), constraint.given(place.model)
+    name, given = row_name(constraint.family, order), constraint.given(point.model)
     if order == "first":
         outputs = {"value": value, "gradient": ca.densify(ca.gradient(value, y))}
         return named_function(name, inputs | given, outputs)
@@ -370,7 +370,7 @@ def closure_functions(model: CellModel, arm: int) -> dict[str, ca.Function]:
 
     joints = ca.SX.sym("q", n)
     held = pose_error(*target, *own.placement(joints))[0]
-    tied = [pose[place] - joints[joint] for joint, place in own.redundant]
+    tied = [pose[point] - joints[joint] for joint, point in own.redundant]
     closure = ca.vertcat(held, *tied)
     pull = -ca.solve(ca.jacobian(closure, joints), ca.SX.eye(n))
     follow = ca.mtimes(pull, ca.jacobian(closure, pose))
