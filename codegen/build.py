@@ -254,7 +254,8 @@ def build(
         functions: CasADi functions by name.
         cache: cache of the libraries; None for the user's.
         key: key under which `load_or_build` finds the set later; None to store no such key.
-        levels: optimisation levels by name; the size of the C text decides the others.
+        levels: optimisation levels by name of the function. The size of the C text decides the
+            level of other functions; None for all.
         rebuild: True to compile functions again that are in the cache.
         lanes: number of evaluations of a batch that run side by side; 0 for the machine's width.
 
@@ -295,7 +296,8 @@ def load_or_build(
         key: digest of everything on which `make` depends, except the version of CasADi.
         make: function that returns the CasADi functions by name; its errors are passed on.
         cache: cache of the libraries; None for the user's.
-        levels: optimisation levels by name; the size of the C text decides the others.
+        levels: optimisation levels by name of the function. The size of the C text decides the
+            level of other functions; None for all.
         lanes: number of evaluations of a batch that run side by side; 0 for the machine's width.
         taped: True to store functions over SX as tapes and compile only the others.
 
@@ -454,9 +456,18 @@ def _obtained(
     cache: Cache,
     load: Callable[[str, Cache], Member | None],
 ) -> dict[str, Member]:
-    """Load all libraries or tapes of a set, by name. `key` is the key of the set's record in the
-    cache, and `load` loads one of them by its own key. If any is missing, `make` makes all of them,
-    and the record is stored."""
+    """Load all libraries or tapes of a set. If any is missing, make all of them and store the
+    record of the set, the list of their keys.
+
+    Args:
+        key: key of the set's record in the cache.
+        make: function that makes and stores all members, by name.
+        cache: the cache.
+        load: function that loads one member by its own key; it returns None if there is none.
+
+    Returns:
+        The libraries or tapes by name.
+    """
 
     def find() -> dict[str, Member] | None:
         record = cache.read_record(key)

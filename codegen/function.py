@@ -232,8 +232,8 @@ class NumericFunction(ABC):
         Args:
             n: largest number of evaluations, at least 1.
             shared: names of inputs with one value for all evaluations.
-            given: the caller's own arrays for some inputs and outputs, each
-                C-contiguous and (n, ...) with its shape after n; shared inputs without n.
+            given: the caller's own arrays for some inputs and outputs, each C-contiguous and (n,
+                ...) with its shape after n; shared inputs without n. None to allocate all arrays.
 
         Raises:
             CodegenError: an array does not fit.

@@ -316,7 +316,7 @@ def thread_pool() -> ThreadPoolExecutor:
 
 
 def _same(a: Array, b: Array) -> bool:
-    """Return True if two arrays hold the same bits, with all NaN equal."""
+    """Return True if the arrays `a` and `b` hold the same bits, with all NaN equal."""
     unlike = a.view(np.int64) != b.view(np.int64)
     return not (unlike & ~(np.isnan(a) & np.isnan(b))).any()
 

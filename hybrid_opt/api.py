@@ -182,7 +182,8 @@ def save(carry: Carry, path: str | Path, provenance: Mapping[str, Any] | None = 
     Args:
         carry: the carry to store, from `Cell.carry`.
         path: path of the file; an existing file is replaced.
-        provenance: origin of the carry as JSON values by name (algorithm, seed, ...).
+        provenance: origin of the carry as JSON values by name (algorithm, seed, ...); None for
+            none.
 
     Raises:
         ResultsError: the workcell was changed after reading, or the file cannot be written.

@@ -299,7 +299,9 @@ class BoxMotion:
     second_rate: Array
 
     def at(self, rows: NDArray[np.intp] | NDArray[np.bool_]) -> BoxMotion:
-        """Return the motion at some samples, given by indices or by a mask (n,)."""
+        """Return the motion at the samples `rows`: indices (m,), or a mask (n,) that is True for
+        them.
+        """
         return BoxMotion(self.pose[rows], self.rate[rows], self.second_rate[rows])
 
 

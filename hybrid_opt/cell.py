@@ -110,7 +110,8 @@ class Cell:
             path: path of the workcell file.
             objectives: objectives that searches minimise: names in `OBJECTIVES`, or `Objective`
                 records.
-            threads: number of threads that evaluate candidates, as in the constructor.
+            threads: number of threads that evaluate candidates, 0 for one per core; None as in the
+                constructor.
 
         Raises:
             WorkcellError: the file is wrong; the message lists every problem.
@@ -133,7 +134,8 @@ class Cell:
             files: content of the workcell file and of the files that it names.
             objectives: objectives that searches minimise: names in `OBJECTIVES`, or `Objective`
                 records.
-            threads: number of threads that evaluate candidates, as in the constructor.
+            threads: number of threads that evaluate candidates, 0 for one per core; None as in the
+                constructor.
 
         Raises:
             SettingsError: an objective is unknown, or given twice.

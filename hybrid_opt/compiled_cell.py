@@ -55,7 +55,7 @@ class CompiledCell:
             workcell: description of the cell.
             cache: cache of compiled libraries, None for the user's cache.
             model: symbolic model of the cell if it does not follow from the workcell alone, for
-                example with other start postures.
+                example with other start postures; None to build it from the workcell.
 
         Raises:
             CodegenError: there is no C compiler, and the cache knows of none.
@@ -255,8 +255,8 @@ class CompiledCell:
             details: further values on which the functions depend.
             lanes: number of evaluations of a batch that run side by side; 0 for the machine's
                 width.
-            levels: optimisation levels of the compiler by name of the function; the size of the C
-                text decides the others.
+            levels: optimisation levels of the compiler by name of the function. The size of the C
+                text decides the level of other functions; None for all.
             bodies: True if the functions depend on the collision bodies.
             taped: True to compile only functions with CasADi's MX expressions. Functions with SX
                 expressions are stored as tapes, lists of operations that an interpreter runs.

@@ -108,7 +108,7 @@ def still_load(
         workcell: the description of the cell.
         pose: (6,) box pose [m, rad].
         friction: factor on both friction coefficients.
-        function: load function in place of the cell's, from `uncertain_load_function`.
+        function: load function from `uncertain_load_function`; None for the cell's.
 
     Returns:
         Flat arrays by the names in `symbolic.contact.load.LOAD_OUTPUTS`.
@@ -311,7 +311,7 @@ class _Still:
 
     def remedy(self, exceeded: list[StaticUtilisation]) -> str:
         """Return a text with the largest payload mass, the least friction and the least patch
-        radius that keep some limits.
+        radius with which no given limit is exceeded.
 
         Mass and friction are alternatives, each with everything else unchanged.
 

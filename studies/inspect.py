@@ -78,7 +78,7 @@ def _add_options(parser: Parser) -> None:
 
 
 def _heights(text: str | None) -> tuple[float, ...]:
-    """Parse heights [m] from 'Z,Z'; none if there is no text.
+    """Parse heights [m] from a text such as '0.5,0.8'; () for None.
 
     Raises:
         SettingsError: the text is no list of numbers.

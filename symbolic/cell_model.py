@@ -77,7 +77,8 @@ def build_cell_bodies(workcell: Workcell, known: CellBodies | None = None) -> Ce
     Args:
         workcell: description of the cell.
         known: arms and bodies of a cell that differs only in the path, or in how the pads hold the
-            box. Its functions are reused if both cells check the same pairs of bodies.
+            box. Its functions are reused if both cells check the same pairs of bodies. None for no
+            such cell.
 
     Raises:
         RobotModelError: a URDF does not describe a usable arm.

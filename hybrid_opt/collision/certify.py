@@ -202,7 +202,7 @@ def _straight_grid(
 ) -> _Grid:
     """Refine the grids of all paths as `certify_all` describes.
 
-    An interval in whose middle an arm loses the path is not refined.
+    An interval is not refined if an arm cannot follow the path in its middle.
 
     Args:
         checker: collision checker of the workcell.

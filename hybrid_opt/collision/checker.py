@@ -389,10 +389,10 @@ class CollisionChecker:
         return found
 
     def _find_resting(self) -> list[tuple[int, Array, float]]:
-        """Find the places at which the payload may rest on a body.
+        """Find the box positions at which the payload may rest on a body.
 
         Returns:
-            For each place, as in `resting_places`: index of the pair of payload and body, box
+            For each position, as in `resting_places`: index of the pair of payload and body, box
             centre (3,) [m] in the world, and departure [m] (distance from this centre within which
             the payload may touch the body).
         """
@@ -487,12 +487,12 @@ class BodyDistances:
             placed: outputs of the function `piece_poses` for n samples.
             rows: (m,) index of the sample of each query.
             first, second: (m,) indices of the two bodies of each query in `bodies`.
-            apart: (m,) `APART` proves a distance above this value [m].
-            overlap: (m,) `INTERSECTING` proves a depth of intersection above this value [m]. If the
-                value is negative, it proves a distance below minus the value.
+            apart: (m,) least distance that counts as apart [m].
+            overlap: (m,) least depth of intersection that counts as intersecting [m]. With a
+                negative value bodies count as intersecting if they are closer than its magnitude.
 
         Returns:
-            (m,) `APART`, `INTERSECTING`, or `OPEN` if neither is proven.
+            (m,) `APART` or `INTERSECTING` if that is proven, else `OPEN`.
         """
         at = placed["quaternions"], placed["positions"]
         found: NDArray[np.int8] = self.native.decide(*at, rows, first, second, apart, overlap)

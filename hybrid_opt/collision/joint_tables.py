@@ -212,7 +212,8 @@ class _PieceDistances:
         Args:
             q: (n, 2) positions of the two joints between the links [rad].
             rows: (m,) index in `q` of the joint positions of each query.
-            moving: (m,) index in `moving` of the piece of each query.
+            moving: (m,) index of the piece of each query among the other link's pieces, the
+                attribute `moving`.
         """
         # Not imported at the top: SciPy takes long to start, and cells without meshes need none.
         from scipy.spatial.transform import Rotation

@@ -39,7 +39,7 @@ UNPUBLISHED = "unknown"
 
 
 def torque_use(use: float | None) -> str:
-    """Format a ratio of joint torque to torque limit in percent.
+    """Format the ratio `use` of joint torque to torque limit in percent; `NOTHING` for None.
 
     A ratio of zero means that the robot's limits are unknown, and gives `UNPUBLISHED`.
     """
@@ -82,7 +82,7 @@ class Quantity:
         return f"{named} [{self.unit}]" if self.unit else named
 
     def __call__(self, value: float | None) -> str:
-        """Format a value in SI units as a printed number without its unit."""
+        """Format a value in SI units as a printed number without its unit; `NOTHING` for None."""
         return number(value, self.digits, self.scale)
 
     def mean(self, mean: float | None, std: float | None) -> str:

@@ -301,7 +301,7 @@ class CandidateEvaluator:
             x: (n_var,) decision vector.
 
         Raises:
-            LostPathError: an arm loses the path, on its samples or between them.
+            LostPathError: an arm cannot follow the path, on its samples or between them.
         """
         (path,) = self._paths(self._checked(x)[:1])
         if path is None:
@@ -467,10 +467,10 @@ def _failure(certificate: Certificate | None) -> float | None:
     """Return the path parameter u in [0, 1] at which a certificate fails.
 
     Args:
-        certificate: the certificate; None if an arm loses the path on a sample.
+        certificate: the certificate; None if an arm cannot follow the path at a sample.
 
     Returns:
-        The path parameter; 0 if an arm loses the path; None for a path that is proven free.
+        The path parameter; 0 if an arm cannot follow the path; None for a path that is proven free.
     """
     if certificate is not None and certificate.is_free:
         return None

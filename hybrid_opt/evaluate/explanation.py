@@ -136,7 +136,8 @@ def _explained(
 
 
 def missing_reach(robot: Robot, contact: Contact, T_world_box: Array, q: Array) -> float:
-    """Compute how far the flange of an arm stays from the place at which it would hold the box [m].
+    """Compute how far the flange of an arm stays from the position at which it would hold the box
+    [m].
 
     Damped least squares reduce the errors of position and orientation together, within the joint
     limits. The result is the position error of the best posture found. From another initial posture

@@ -93,7 +93,8 @@ def evaluate_numpy(outputs: Mapping[str, Array], checker: CollisionChecker) -> S
 
 
 def reached_samples(outputs: Mapping[str, Array], row: int) -> tuple[Array, Array, Array]:
-    """Return the motion of a candidate before the first sample at which an arm loses the path.
+    """Return the motion of a candidate before the first sample at which an arm does not reach the
+    box.
 
     Only these k samples are checked for collisions.
 

@@ -230,7 +230,7 @@ def require_skew(job: Job, delay: float, stiffness: float) -> None:
 
 
 def _displacement(job: Job, phase: Phase, late: int, delay: float) -> tuple[Array, Array, Array]:
-    """Compute how the pad of an arm is displaced from its planned place if that arm is late.
+    """Compute how the pad of an arm is displaced from its planned position if that arm is late.
 
     Args:
         job: the whole job.

@@ -124,8 +124,8 @@ class Straight:
             share: (n,) points, from 0 at the beginning to 1 at the end of the line.
 
         Returns:
-            Poses (n, 6) of the box, then places (n, 6) of the pad of each arm as box poses [m,
-            rad].
+            Poses (n, 6) of the box [m, rad]. Then for each arm the positions of its pad, stated as
+            the box poses (n, 6) at which the pad would touch the box there [m, rad].
         """
         ways = np.concatenate([self.box[None], self.held])
         poses = ways[:, None, 0] + share[:, None] * (ways[:, 1] - ways[:, 0])[:, None]
@@ -204,8 +204,8 @@ def follow_line(
     """
 
     def share(way: Array) -> Array:
-        """Convert points in [0, 1], counted from that end of the line at which the joints are
-        known, to points counted from the beginning of the line.
+        """Convert points `way` (n,) in [0, 1], counted from that end of the line at which the
+        joints are known, to points (n,) counted from the beginning of the line.
         """
         return 1.0 - way if at_end else way
 

@@ -140,7 +140,7 @@ def extreme_attempt(
     Args:
         archive: the points of the front and other known points.
         objective: index of the objective that is least at the end; None for the balanced middle.
-        tried: objective and start, as bytes, of all attempts so far.
+        tried: objective (None for the middle) and start, as bytes, of all attempts so far.
         stalled: True if the last attempt brought no progress.
         perturb: function from a decision vector and an objective to a perturbed start.
         rng: generator that chooses the untried point.

@@ -243,18 +243,18 @@ class IntervalValues:
         self.value, self.slope = value, slope
 
     def at_rest(self, force: float) -> tuple[Array, Array]:
-        """Compute which share of its limit each contact uses while the box is at rest at the
-        beginning of every interval.
+        """Compute the ratio of value to limit for each contact while the box is at rest, at the
+        beginning of every interval of the timing.
 
-        What is limited is the pressure shift; for pads without a limit on pressure it is the normal
-        force.
+        The limited quantity is the pressure shift or, for pads without a limit on pressure, the
+        normal force.
 
         Args:
             force: the force limit [N].
 
         Returns:
-            Used shares (rows,), and their derivatives (rows, moving) by the box pose with redundant
-            joints and by its first and second derivative by u.
+            Ratios (2 intervals,), and their derivatives (2 intervals, moving) by the box pose with
+            redundant joints and by its first and second derivative by u.
         """
         begins = [values[::2] for values in self._inputs]
         still, grid = np.zeros(len(begins[-1])), self._grid

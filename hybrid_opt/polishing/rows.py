@@ -81,7 +81,7 @@ Row = ForceRow | PressureRow | PathRow
 
 @cache
 def _sort_key(constraint: PathConstraint) -> tuple[str, str]:
-    """Return a key that sorts constraints by their kind, then by the text of their fields."""
+    """Return the sort key of a constraint: its kind, then the text of its fields."""
     return constraint.family.rstrip("_0123456789"), repr(constraint)
 
 

@@ -183,8 +183,8 @@ def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str
     """Yield small changes of the cell as text, each with the resulting change of the largest
     commanded force along a motion [N], negative if the force falls.
 
-    Hands that hold more are worth more force: the force of the changed cell is divided by the ratio
-    of its strength (`ContactModel.strength`) to the present one.
+    Stronger hands may need a larger force, so the force of the changed cell is divided by the ratio
+    of the holding forces (`ContactModel.strength`) of changed to present hands.
 
     Args:
         workcell: the cell.

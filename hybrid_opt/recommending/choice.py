@@ -185,10 +185,8 @@ class Goal:
 
 
 def commanded_at_most(force: float, others: Array | float = np.inf) -> Array:
-    """Return the upper bound (2,) of each robot's normal force [N] that limits the commanded force.
-
-    The entry of the force-controlled arm is `force`, or `others` if that is less; the entry of the
-    position-controlled arm is `others`.
+    """Return the upper bounds (2,) of both robots' normal forces [N] that follow from a limit on
+    the commanded force, which is the force of the force-controlled arm.
 
     Args:
         force: largest allowed commanded force [N].

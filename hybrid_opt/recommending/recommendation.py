@@ -193,7 +193,7 @@ def recommend(
         front: front of a drivable cell, see `Cell.drivable`.
         wish: another target, or numbers that replace the cell's; None for the default target.
         others: further paths (n_path,) by label, to compare with the recommended carry; the
-            hand-made path is always compared.
+            hand-made path is always compared. None for no further paths.
         progress: True for a progress bar, or a function of the finished and the total number of
             steps.
         alone: True to leave out the margins, the comparison with other paths and the advice.

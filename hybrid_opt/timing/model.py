@@ -399,9 +399,15 @@ class TimingModel:
     def uncertain_load(
         self, carry: Carry, friction: Array, centre_of_mass: Array
     ) -> dict[str, Array]:
-        """Compute the outputs `symbolic.contact.load.LOAD_OUTPUTS` (forces and wrenches by name) of
-        a carry with changed friction coefficients (2,) and a changed centre of mass (3,) in the box
-        frame [m].
+        """Compute the forces of a carry in a cell with other friction and another centre of mass.
+
+        Args:
+            carry: the carry.
+            friction: (2,) friction coefficients.
+            centre_of_mass: (3,) centre of mass in the box frame [m].
+
+        Returns:
+            Forces and wrenches by the names in `symbolic.contact.load.LOAD_OUTPUTS`.
         """
         return self._functions["uncertain_load"].batch(
             carry.pose, carry.rate, carry.second_rate, friction, centre_of_mass
@@ -458,8 +464,13 @@ class TimingModel:
         return contact_torque(len(self.joint_names[0]), wrench_torque, wrenches)
 
     def carry(self, motion: PathMotion, time: Array, speed: Array, acceleration: Array) -> Carry:
-        """Return the carry that drives a path with given times (n,) [s], path speeds u' (n,) [1/s]
-        and path accelerations u'' (n,) [1/s^2] at the samples of `motion`."""
+        """Return the carry that drives a path with a given timing.
+
+        Args:
+            motion: geometry of the path at n samples.
+            time: (n,) times of the samples [s].
+            speed, acceleration: (n,) path speeds u' [1/s] and path accelerations u'' [1/s^2].
+        """
         load = self.drive(motion, speed, acceleration)
         v, w, a = speed[:, None], speed[:, None] ** 2, acceleration[:, None]
         own = motion.torque_by_acceleration * a + motion.torque_by_speed * w
@@ -541,8 +552,9 @@ class SpeedProfile:
 
     @classmethod
     def from_grid_speed(cls, grid_speed: Array) -> SpeedProfile:
-        """Return the profile with given path speeds u' (intervals + 1,) [1/s] at the grid points,
-        and constant u'' between them."""
+        """Return the profile with the path speeds u' `grid_speed` (intervals + 1,) [1/s] at the
+        grid points, and constant u'' between them.
+        """
         squared, intervals = grid_speed**2, len(grid_speed) - 1
         share = np.linspace(0.0, 1.0, REFINEMENT + 1)
         w = squared[:-1, None] + np.outer(np.diff(squared), share)

@@ -440,7 +440,7 @@ def limit_place(
     sample: int,
     parameter: float,
 ) -> Place:
-    """Describe the place on a path at which a limit is used most.
+    """Describe the limit, joint and point of a path at which a limit is used most.
 
     Args:
         workcell: the workcell.

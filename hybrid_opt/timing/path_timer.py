@@ -126,7 +126,7 @@ class PathTimer:
     def path_errors(self, paths: dict[str, Array]) -> list[PathTiming | None]:
         """Find for each of n paths the error that rules out a timing.
 
-        Errors are: no motion, an arm that loses the path, joint limits, and manipulability.
+        Errors are: no motion, an arm that does not reach the box, joint limits, and manipulability.
 
         Args:
             paths: result of `path_limits`.

@@ -327,9 +327,10 @@ class TimingSensitivity:
         order.
 
         Args:
-            low: result of `CarryLimits.ratios` for the motion `speeds` of the path, with the number
+            low: ratios of all limited quantities to their limits (`CarryLimits.ratios`) for the
+                path with the speeds of the fastest timing (attribute `speeds`), with the number
                 lowered.
-            high: result for the same motion with the number raised by the same amount.
+            high: the same ratios with the number raised by the same amount.
 
         Returns:
             Change of the duration [s] with the number raised, and with it lowered; NaN if no timing

@@ -254,7 +254,8 @@ class _CuttingPlaneProblem:
         return worst_excess
 
     def _tighten(self, squared: Array) -> bool:
-        """Tighten the limits of the intervals in which a timing exceeds a limit between the points.
+        """Tighten the limits of the intervals in which a timing exceeds a limit between the points
+        at which the limits apply.
 
         Args:
             squared: (intervals + 1,) squared speeds of the timing in the scaled path coordinate.

@@ -183,6 +183,11 @@ def _kinds() -> list[ProblemChange]:
 def _least_changes(problem: Problem, spins: Array, seed: int) -> str | None:
     """Return text on the least changes of bases and tools with which both arms can hold the box at
     some pose: '' if no tried change is enough, None if the file states neither bases nor tools.
+
+    Args:
+        problem: the problem.
+        spins: rotations of a pad about its normal to try [rad].
+        seed: seed of the random postures.
     """
     if not states_machine(problem):
         return None

@@ -339,7 +339,7 @@ def front_indicators(
         front: (n, n_obj) objectives of the front.
         reference: (k, n_obj) reference front for the IGD.
         selected: the selected carry, None without a feasible candidate.
-        file: path of its trajectory file, relative to the results folder.
+        file: path of its trajectory file, relative to the results folder; None without one.
     """
     carry = None if selected is None else selected.carry
     return {
@@ -366,7 +366,7 @@ def replica_figures(
         replica: the stored search.
         reference: (k, n_obj) reference front for the IGD.
         selected: the selected carry, None without a feasible candidate.
-        file: path of its trajectory file, relative to the results folder.
+        file: path of its trajectory file, relative to the results folder; None without one.
     """
     found = replica.evaluations
     feasible = found.feasible
@@ -402,7 +402,7 @@ def carry_entry(carry: Carry, evaluation: int, file: str | None) -> SelectedEntr
     Args:
         carry: the carry.
         evaluation: number of the candidate among all evaluated, from 1; 0 for the hand-made one.
-        file: path of the carry's trajectory file, relative to the results folder.
+        file: path of the carry's trajectory file, relative to the results folder; None without one.
     """
     assert carry.judgement is not None, "selected carries are judged"
     return SelectedEntry(

@@ -380,12 +380,17 @@ def barrier_step(program: ConvexProgram, final_weight: float = FINAL_WEIGHT) -> 
 def barrier_equations(
     program: ConvexProgram, states: list[ca.SX], cell: list[ca.SX], final_weight: float
 ) -> tuple[ca.SX, list[ca.SX], Equations]:
-    """Build Newton's equations for the minimum of effort plus barriers, at the state (n,) of each
-    patch. `cell` has the program's inputs.
+    """Build Newton's equations for the minimum of effort plus barriers.
+
+    Args:
+        program: the convex program.
+        states: state (n,) of each patch.
+        cell: the program's inputs.
+        final_weight: weight of the barriers over the effort.
 
     Returns:
-        The barriers' weight, `final_weight` times the effort; the multipliers (n,) of each patch,
-        -weight times the gradient of its barrier; and Newton's equations.
+        The barriers' weight; the multipliers (n,) of each patch, -weight times the gradient of its
+        barrier; and Newton's equations.
     """
     weight = final_weight * program.effort(wrenches_of(program, states), cell)
     patches = zip(program.patches, states, strict=True)

@@ -217,8 +217,8 @@ def commanded_slack(
 
 
 def internal_force_gain(squeeze: GraspSqueeze) -> ca.Function:
-    """Build the function of the commanded force that a push of the arms against each other requires
-    in addition, in newtons per newton of the push.
+    """Build the function of the additional commanded force per newton with which the arms push
+    against each other.
 
     The push is a tangential force at any one of the pads. Friction has to bear it, so the pads
     press harder. Inputs: friction coefficients (2,) and relative patch sizes (2,) of the robots,

@@ -116,7 +116,9 @@ class ImplicitVariables:
         return ca.vertcat(ca.SX(0, 1), *[value for _, value in self._found])
 
     def replaced(self, outputs: list[Expression]) -> list[Expression]:
-        """Return expressions with every symbol replaced by the expression that it stands for."""
+        """Return the expressions `outputs` with every symbol replaced by the expression that it
+        stands for.
+        """
         if not self._found:
             return outputs
         found: list[Expression] = ca.substitute(outputs, [self.symbols], [self.values])

@@ -183,8 +183,8 @@ def arm_geometry(workcell: Workcell, i: int) -> ArmGeometry:
 
 
 def _check_effort(bodies: list[CollisionBody], most_pieces: int) -> None:
-    """Check that the bodies have at most `most_pieces` convex pieces, so that pairs are decided in
-    seconds.
+    """Check that the bodies have at most `most_pieces` convex pieces, so that all pairs can be
+    checked within seconds.
 
     Raises:
         CollisionModelError: the bodies have more pieces, or more than `MOST_CORNERS` corners.

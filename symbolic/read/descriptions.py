@@ -263,11 +263,10 @@ _NOMINAL = re.compile(r"default_kinematics\.ya?ml$", re.IGNORECASE)
 
 
 def nominal_kinematics(content: bytes, arguments: Arguments) -> str:
-    """Return the name of the xacro argument that should state an arm's measured kinematics, if no
-    measured values are given.
+    """Return the name of the xacro argument with which an arm's measured kinematics should be
+    stated; '' if they are stated, or if the file has no such argument.
 
-    None are given if the argument has no value, or if its value is the maker's nominal file. The
-    result is '' if measured kinematics are given, or if the file has no such argument.
+    They are not stated if the argument has no value, or if its value is the maker's nominal file.
 
     Args:
         content: content of the xacro file.

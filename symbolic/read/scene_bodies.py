@@ -296,7 +296,8 @@ def file_at(address: str, file: Path) -> Path | None:
 
 def _main_file(folder: Path) -> str | None:
     """Return the name of the description file in a model's folder, as its model.config states it.
-    Of several versions it is the last one."""
+    Of several versions it is the last one. None if the folder has no such file.
+    """
     config = folder / "model.config"
     if not config.is_file():
         return None

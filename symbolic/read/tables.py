@@ -179,13 +179,15 @@ class TableReader:
 
     def choice(self, key: str, allowed: Sequence[str], default: str | None = None) -> str:
         """Read the text at a key, one of the words `allowed`; '' after a problem, `default` if it
-        is missing."""
+        is missing. Without a default a missing key is a problem.
+        """
         usual = _REQUIRED if default is None else default
         return str(self.value(key, Literal[tuple(allowed)], usual))
 
     def text(self, key: str, default: str | None = None) -> str:
         """Read the printable, non-empty, single-line text at a key; '' after a problem, `default`
-        if missing."""
+        if it is missing. Without a default a missing key is a problem.
+        """
         return str(self.value(key, Label, _REQUIRED if default is None else default))
 
     def texts(self, key: str, meaning: str) -> tuple[str, ...]:
@@ -532,7 +534,7 @@ def read_file(
         table, key: table and key that name the file.
         folder: folder to which the path is relative.
         most: largest allowed size [bytes].
-        at: path of the file if its name is an address and not a path.
+        at: path of the file if its name is an address; None if its name is a path.
     """
     value = table.raw(key)
     if value is None:

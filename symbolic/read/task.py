@@ -513,7 +513,7 @@ class _Chain:
         return None
 
     def within(self, q: Array) -> bool:
-        """Return True if every joint is within its limits."""
+        """Return True if every joint position in q (joints,) is within its limits."""
         return bool(np.all((q >= self.robot.position_lower) & (q <= self.robot.position_upper)))
 
     def starts(self) -> Array:

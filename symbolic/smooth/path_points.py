@@ -246,7 +246,9 @@ class JointLimit(PathConstraint):
         return (self.arm,)
 
     def given(self, model: CellBodies) -> dict[str, ca.SX]:
-        """Return an empty dictionary: the limit itself is one of the constraint's `numbers`."""
+        """Return an empty dictionary, because the constraint depends on no symbolic parameter of
+        the cell: the limit is one of its own `numbers`.
+        """
         return {}
 
 

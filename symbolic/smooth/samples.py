@@ -247,7 +247,7 @@ def _at_samples(
         of_motion: function of one sample that computes the quantity. Its inputs are pose, rate and
             second_rate (6,), the box pose and its time derivatives, and the payload's parameters.
         along: arguments of `timed_path`: spline basis, waypoints (6, n_waypoints), and relative
-            width of the rounding.
+            width of the rounding, None for none.
         columns: indices of the chosen samples among those of the basis.
         handed: parameters of task and payload by group.
     """

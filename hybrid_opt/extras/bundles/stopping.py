@@ -147,7 +147,9 @@ class PartnerStop:
 
     @property
     def warning(self) -> str:
-        """Warning and remedy if friction may lose the box in such a stop, else ''."""
+        """Warning and remedy if friction may not hold the box when one arm stops by itself, else
+        ''.
+        """
         if self.survived is None or self.distance <= self.survived:
             return ""
         return (

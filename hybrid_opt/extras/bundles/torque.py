@@ -322,8 +322,8 @@ def joint_inertia(job: Job) -> Array:
 
 
 def _values(export: Export, arm: int) -> dict[str, Any]:
-    """Return the values that replace those placeholders of an arm's template that the drivers of
-    all makers have in common.
+    """Return values for those placeholders of an arm's template that the templates of all makers
+    share.
 
     Args:
         export: the job.

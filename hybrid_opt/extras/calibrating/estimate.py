@@ -97,19 +97,21 @@ class Load:
 
     @property
     def is_mass_observable(self) -> bool:
-        """True if the holds determine the mass accurately."""
+        """True if the measurements of the held box determine the mass accurately."""
         return bool(self.deviations[0] <= SEEN_MASS * abs(self.mass))
 
     @property
     def observable_centre(self) -> Array:
-        """(3,) True for each box axis along which the holds determine the centre of mass
-        accurately.
+        """(3,) True for each box axis along which the measurements of the held box determine the
+        centre of mass accurately.
         """
         return np.asarray(self.deviations[1:4] <= SEEN_CENTRE)
 
     @property
     def observable_crosstalk(self) -> Array:
-        """(2, 2) True for each entry of `crosstalk` that the holds determine accurately."""
+        """(2, 2) True for each entry of `crosstalk` that the measurements of the held box determine
+        accurately.
+        """
         return np.asarray(self.deviations[4:].reshape(2, 2) <= SEEN_CROSSTALK)
 
 
@@ -288,7 +290,8 @@ class FrictionRatio:
             self._capacity.append(ca.Function("capacity", [grip, tangent], [carried]))
 
     def __call__(self, wrench: Array) -> float:
-        """Compute the friction coefficient, equal for both pads, that just holds measured wrenches.
+        """Compute the friction coefficient, equal for both pads, with which the pads just transmit
+        measured wrenches.
 
         Args:
             wrench: (2, 6) force and moment on each arm about the pad's centre, along the pad's

@@ -88,7 +88,8 @@ class _Follower:
         self.lower, self.upper = many.lower + LIMIT_MARGIN, many.upper - LIMIT_MARGIN
 
     def follow(self, T_world_box: Array, extended: Array, q: Array) -> tuple[Array, str]:
-        """Follow poses of the box, each from the joint positions before.
+        """Compute the arm's joint positions along poses of the box. Each solution starts from the
+        one before it.
 
         Args:
             T_world_box: (n, 4, 4) poses of the box.

@@ -129,7 +129,7 @@ def changes(problem: Problem, found: Draft) -> dict[str, Any]:
 
 
 def decision_bounds(workcell: Workcell) -> tuple[Array, Array]:
-    """Compute how wide and how far the bounds of the decision vector may be.
+    """Return typical widths, and limits, of the bounds of the decision vector.
 
     Args:
         workcell: the cell, with the hand-made trajectory.

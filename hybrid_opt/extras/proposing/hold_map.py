@@ -377,8 +377,9 @@ def _multiples(low: float, high: float, step: float) -> Array:
 def _common_positions(
     arms: Sequence[ArmKinematics], rng: np.random.Generator
 ) -> list[Array | None]:
-    """Return positions (k,) of the k joints that move both arms [rad or m]; None, once, if there
-    are no such joints."""
+    """Return a list of positions (k,) to try for the k joints that move both arms [rad or m];
+    [None] if there are no such joints.
+    """
     if not arms[0].common:
         return [None]
     machine = MachineKinematics(arms)

@@ -322,8 +322,8 @@ def read_problem(path: str | Path, with_poses: bool = True) -> Problem:
 
 
 def _add_poses(table: TableReader, data: dict[str, Any]) -> None:
-    """Put provisional poses between the robots' bases into the task, where there are none, and drop
-    what only a carry needs. Report missing bases.
+    """Add a start and a goal near the robots' bases to a task that lacks them, and remove keys that
+    only a carry needs. Report missing bases.
 
     Args:
         table: reader of the whole problem file.

@@ -155,8 +155,9 @@ def changes_text(found: Sequence[tuple[ProblemChange, float]]) -> str:
 
 
 def states_machine(problem: Problem) -> bool:
-    """Return True if a problem's file states the bases and the pads of both robots, which changes
-    move."""
+    """Return True if a problem's file states the bases and the pads of both robots. Only then can
+    changes of the problem move them.
+    """
     robots = problem.data["robots"]
     return all("xyz" in robot.get("base", {}) and "xyz" in robot.get("pad", {}) for robot in robots)
 

@@ -123,8 +123,8 @@ def fit(
     """Find via-points whose spline from start to goal is free of collisions; None if none are
     found.
 
-    Tried are points on the path at even distances, the points whose spline is nearest to the path,
-    interpolations between these two, and random shifts of the best.
+    The search tries points on the path at even distances, the points whose spline is nearest to the
+    path, interpolations between these two, and random shifts of the best.
 
     Args:
         chain: both arms, whose pads stay fixed on the box.

@@ -111,20 +111,21 @@ class Threshold(Generic[AnyOutcome]):
 def bisected(
     simulate: Callable[[float], AnyOutcome], low: float, high: float, steps: int
 ) -> Threshold[AnyOutcome]:
-    """Find by bisection the least factor with which the box holds in a simulation.
+    """Find by bisection the least factor on the forces with which the box does not slip in a
+    simulation.
 
     Args:
         simulate: function that runs a simulation with a factor and returns its outcome.
         low: factor at which the box slips.
-        high: factor at which the box holds.
+        high: factor at which the box does not slip.
         steps: number of bisections.
 
     Returns:
         The outcome with the largest factor found at which the box slips, and the one with the least
-        factor found at which it holds.
+        factor found at which it does not.
 
     Raises:
-        SimulationError: the box holds at `low` or slips at `high`.
+        SimulationError: the box does not slip at `low`, or slips at `high`.
     """
     slips, holds = simulate(low), simulate(high)
     if slips.holds or not holds.holds:

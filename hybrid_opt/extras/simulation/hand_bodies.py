@@ -126,7 +126,9 @@ class HandSprings:
         return float(np.sqrt(squares[0]) / (2.0 * np.pi))
 
     def bodies(self) -> str:
-        """Return all hands as MJCF, bodies `hand_K` of the carriage or of the arms `arm_I`."""
+        """Return all hands as MJCF: bodies `hand_K`, mounted on the arms `arm_I` or directly on the
+        carriage, the moving body that bears all of them.
+        """
         pads, robots = self.workcell.pads, self.workcell.pad_robots
         each = self.workcell.payload.mass / len(pads)
         if self.arms is None:
@@ -137,7 +139,8 @@ class HandSprings:
         return "\n".join(self._arm_text(i, robots.count(i) * each) for i in (0, 1))
 
     def _arm_text(self, arm: int, borne: float) -> str:
-        """Return an arm with its hands as MJCF, a body of the carriage.
+        """Return an arm with its hands as MJCF: a body on the carriage, the moving body that bears
+        all hands.
 
         Args:
             arm: index of the arm.

@@ -97,7 +97,8 @@ class HandCase:
 
 
 def random_hand_cases(workcell: Workcell, n: int, rng: np.random.Generator) -> list[HandCase]:
-    """Draw n random cases of a cell's uncertainty. Directions are uniformly distributed.
+    """Draw n random cases of a cell's uncertainty. The directions of the force between the arms and
+    of the rotation axis are uniformly distributed.
 
     Args:
         workcell: the cell.

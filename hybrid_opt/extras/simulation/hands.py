@@ -219,10 +219,10 @@ class HandSimulation:
 
 
 def own_forces(workcell: Workcell, forces: Array) -> Array:
-    """Scale the needed holding forces from the weaker hands of a cell to each robot's own hands.
+    """Scale needed holding forces from the weaker hands of a cell to each robot's own hands.
 
-    The contact model states for each robot the force that hands as weak as the weaker ones of the
-    cell would need. It is multiplied by the robot's holding force over the lesser of both robots'.
+    The contact model states the forces of both robots for hands with the lesser of both holding
+    forces. Each is multiplied by the robot's own holding force over the lesser one.
 
     Args:
         workcell: the cell.
@@ -359,7 +359,9 @@ class _Displaced:
         self._angular = turned @ T[:, :3, :3]
 
     def displace(self, share: float) -> None:
-        """Displace the hands by a share of their displacement."""
+        """Move the second arm's hands to a share of their final displacement, 0 for none and 1 for
+        all.
+        """
         linear, angular = share * self._linear, share * self._angular
         self._model.qpos_spring[self._joints] = np.column_stack([linear[:, :2], angular[:, 2]])
         self._model.body_pos[self._bodies] = self._at + linear[:, 2:] * self._normals

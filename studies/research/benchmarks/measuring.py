@@ -237,7 +237,7 @@ def shortest_carry(workcell: Path, rng: np.random.Generator) -> ho.Carry:
     """Search for the carry with the shortest joint path by CMA-ES (Hansen, arXiv 1604.00772).
 
     The search stays within the bounds of the free waypoints and starts at the cell's initial
-    trajectory. The carry is certified free of collisions and keeps the cell's largest force.
+    trajectory. The carry is feasible and certified free of collisions.
 
     Args:
         workcell: path of the workcell file.

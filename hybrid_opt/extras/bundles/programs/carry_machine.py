@@ -388,8 +388,8 @@ class Machine:
     def _lands(self, force: str) -> bool:
         """Begin to stop the arms if a wrong force may mean that the box stands on its support.
 
-        That may be in the last part of the set-down. No stop begins if the release would begin
-        before the arms are at rest.
+        This can only happen in the last part of the set-down. No stop begins if the release would
+        begin before the arms are at rest.
 
         Args:
             force: text on the wrong force, for `status`.
@@ -459,7 +459,8 @@ class Machine:
         return str(self.job.robots[arm]["name"])
 
     def _require_places(self, seen: Seen, most: float, slack: float = 0.0) -> None:
-        """Check that both arms report and are where the job stands.
+        """Check that both arms report their state, and that they are at the present point of the
+        path.
 
         Args:
             seen: measured state of both arms.
