@@ -33,7 +33,7 @@ def search(
     settings: SearchSettings | None = None,
     progress: ShowProgress = False,
 ) -> Front:
-    """Search for the carries with the least objectives and return them as a front.
+    """Search for non-dominated carries and return them as a front.
 
     Args:
         cell: the cell to search.

@@ -169,7 +169,7 @@ class WorkcellParameters:
 
     @property
     def workcell(self) -> NumberedWorkcell:
-        """Topology of the cell: its description, with a `Parameter` in the place of every
+        """Topology of the cell: its description, with a `Parameter` in place of every
         parameter's value."""
         return self._collected[1]
 
@@ -214,7 +214,7 @@ class WorkcellParameters:
         return digest_of_parts((self._collected[1],))
 
     def symbols(self) -> NumberedWorkcell:
-        """Return the cell's description with CasADi symbols in the place of all parameters."""
+        """Return the cell's description with CasADi symbols in place of all parameters."""
         return _workcell(self._symbols(), self.cell)
 
     def _symbols(self, further: Mapping[str, int] = MappingProxyType({})) -> _Symbols:
@@ -240,7 +240,7 @@ class CellParameters(WorkcellParameters):
 
     @property
     def screen(self) -> Screen:
-        """Topology of the distance bounds, with a `Parameter` in the place of every parameter's
+        """Topology of the distance bounds, with a `Parameter` in place of every parameter's
         value."""
         return self._of_bodies[1]
 
@@ -263,7 +263,7 @@ class CellParameters(WorkcellParameters):
         return digest_of_parts((self.digest, self.screen))
 
     def symbolic(self, bodies: CellBodies) -> CellModel:
-        """Build the model of the cell with CasADi symbols in the place of all parameters. Functions
+        """Build the model of the cell with CasADi symbols in place of all parameters. Functions
         of this model take the parameters as inputs.
 
         Args:

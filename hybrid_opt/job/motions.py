@@ -237,7 +237,7 @@ def solve_joints_at(
     workcell: Workcell, posture: NumericFunction, line: Straight, share: Array, guess: Array
 ) -> Array:
     """Compute the joint positions (n, joints) of both arms [rad] at points of a line; NaN where an
-    arm does not reach its place.
+    arm does not reach its pad pose.
 
     Args:
         workcell: the workcell.

@@ -199,8 +199,8 @@ class DriveRun(PolishRun[DriveAttempt]):
         return DriveAttempt("gap", -1, x, self._evaluator.evaluate(x).objectives[0], moves)
 
     def _rotated(self, force: float) -> list[Array]:
-        """Return paths (n_path,) that start solves with another tilt of the box at the waypoints of
-        the workcell file.
+        """Return paths (n_path,) from which solves start with another tilt of the box at the
+        waypoints of the workcell file.
 
         They are the fastest known path and the hand-made one, each with the box rotated in both
         directions about every axis. For pads whose pressure may shift within the patches, the tilt

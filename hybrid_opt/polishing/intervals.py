@@ -489,8 +489,8 @@ class PathTimingProgram:
         self._geometry_slope = np.concatenate([self._geometry_slope, by_path])
 
     def _speeds(self, w: Array) -> None:
-        """Compute and store the duration, and derivatives by omega, the relative changes of the
-        iterate's squared speeds: of the duration, and of u'' and u'^2 at each point.
+        """Store the duration with its derivatives by omega, the relative changes of the iterate's
+        squared speeds, and the derivatives by omega of u'' and u'^2 at each point.
 
         Args:
             w: (intervals + 1,) squared path speeds u'^2 of the iterate [1/s^2].

@@ -384,8 +384,8 @@ def ranked(options: Sequence[Option], goal: Goal) -> list[Option]:
 def best_of_paths(
     paths: DrivenPaths, options: Sequence[Option], goal: Goal, most: int
 ) -> Iterator[Option]:
-    """Yield the best paths that keep the limits of a goal, each with its cheapest timing, cheapest
-    first.
+    """Yield the best paths that keep the limits of a goal, each with its timing of least cost, in
+    order of cost.
 
     Force limits between the limits of the given timings are tried as well.
 

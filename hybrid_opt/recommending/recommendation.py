@@ -499,7 +499,8 @@ class Alternative:
 def time_alternative(
     cell: Cell, label: str, path: Array, timing: Timing, force: float
 ) -> Alternative:
-    """Compare a path with the recommended carry, at its commanded force and in its duration.
+    """Compare a path with the recommended carry: time it at that carry's commanded force, and find
+    the least force in that carry's duration.
 
     Args:
         cell: drivable cell.

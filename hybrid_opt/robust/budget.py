@@ -93,7 +93,7 @@ class GripBudget:
 
     Attributes:
         required: (2,) normal force that each robot needs [N], the larger of those at the start and
-            at the goal; infinite if no force holds every case.
+            at the goal; infinite if no force holds the box in every case.
         allowed: (2,) reference force of each robot [N].
         uncertainty: ranges of friction, mass and the other uncertain quantities.
         remedies: smallest changes of the cell with which `required` stays within `allowed`; empty

@@ -133,18 +133,20 @@ def _in_discs(rng: np.random.Generator, radius: float, n: int, discs: int) -> Ar
 class GoverningCases:
     """Worst cases that decide the normal forces at n samples of a motion.
 
-    Cases are indices of rows of `worst_cases`. The leading arm is position controlled, the other
-    arm is force controlled.
+    Cases are indices of rows of `worst_cases`. One arm is position controlled, the other arm is
+    force controlled.
 
     Attributes:
-        leader: index of the leading arm.
+        leader: index of the position-controlled arm.
         force: (n, 2) normal force of each robot [N]: the commanded force of the force-controlled
-            arm, and the largest force of the leading arm that results from it in any case.
+            arm, and the largest force of the position-controlled arm that results from it in any
+            case.
         commanded: (n,) index of the case that needs the largest commanded force.
-        leading: (n,) index of the case in which the leading arm's force exceeds the commanded force
-            most.
-        share: (n,) share of this excess that acts on the leading arm, see `transmitted_share`.
-        leading_share: rise of the leading arm's force per newton of commanded force.
+        leading: (n,) index of the case in which the position-controlled arm's force exceeds the
+            commanded force most.
+        share: (n,) share of this excess that acts on the position-controlled arm, see
+            `transmitted_share`.
+        leading_share: rise of the position-controlled arm's force per newton of commanded force.
     """
 
     leader: int

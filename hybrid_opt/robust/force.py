@@ -1,9 +1,9 @@
-"""Least commanded forces that hold every case of an uncertainty, and the largest uncertainty that
-the arms' forces allow.
+"""Least commanded forces that hold the box in every case of an uncertainty, and the largest
+uncertainty that the arms' forces allow.
 
-The leading arm is position controlled; its normal force follows from the motion. The other arm is
-force controlled; its normal force is commanded beforehand, the same in all cases. The motion and
-the case fix N_1 - N_2, so the commanded force decides the squeeze. Pads press evenly in every case
+One arm is position controlled; its normal force follows from the motion. The other arm is force
+controlled; its normal force is commanded beforehand, the same in all cases. The motion and the case
+fix N_1 - N_2, so the commanded force decides the squeeze. Pads press evenly in every case
 (`symbolic.contact.worst_cases`), whichever contact model the plan uses.
 """
 
@@ -118,7 +118,7 @@ class SampledCheck:
 
     @property
     def hardest(self) -> str:
-        """Ratio `closest` in percent, as a text; with 'at most' before it if only an upper bound is
+        """Ratio `closest` in percent, as text; with 'at most' before it if only an upper bound is
         known.
         """
         most = "at most " if self.closest == SCREENED else ""
@@ -150,7 +150,7 @@ class RobustModel:
                 `contact_function`.
 
         Raises:
-            SettingsError: some cases cannot be held, however hard the pads press.
+            SettingsError: the box cannot be held in some cases, however hard the pads press.
             DualArmError: a function cannot be built.
         """
         if problem := command_model(workcell).problem:
@@ -224,13 +224,13 @@ class RobustModel:
         """Compute the least normal forces (m, 2) [N] that hold the box at m samples, each in a case
         of its own.
 
-        The least commanded force is computed; the force of the leading (position-controlled) arm
-        results from it.
+        The least commanded force is computed; the force of the position-controlled arm results from
+        it.
 
         Args:
             motion: box motion at m samples.
             cases: (m, 18) the case at each sample.
-            leader: index of the leading arm.
+            leader: index of the position-controlled arm.
             threads: number of threads, 0 for one per core.
             displaced: True if any case displaces a pad; False is faster.
         """
@@ -247,12 +247,12 @@ class RobustModel:
             motion: box motion at m samples.
             cases: (m, 18) the case at each sample.
             force: (m,) commanded normal forces [N].
-            leader: index of the leading (position-controlled) arm.
+            leader: index of the position-controlled arm.
             threads: number of threads, 0 for one per core.
 
         Returns:
-            Slack (m,). A positive slack proves that the force holds the case; a negative slack
-            proves nothing.
+            Slack (m,). A positive slack proves that the force holds the box in the case; a negative
+            slack proves nothing.
         """
         given = *motion_inputs(motion), cases, force
         return self._slack(1 - leader).batch(*given, threads=threads)["slack"].ravel()
@@ -264,8 +264,8 @@ class RobustModel:
         Args:
             motion: box motion at n samples.
             cases: (k, 18) cases, each applied to all samples.
-            leader: index of the leading (position-controlled) arm; its force results from the
-                commanded force of the other arm.
+            leader: index of the position-controlled arm; its force results from the commanded force
+                of the other arm.
         """
         displaced = bool(cases[:, 11:15].any())
         n = len(motion.pose)
@@ -301,18 +301,19 @@ class RobustModel:
         leader: int = 0,
         rows: NDArray[np.intp] | None = None,
     ) -> tuple[Array, Array]:
-        """Compute the least commanded force that holds every case of an uncertainty, and the force
-        of the leading arm that results from it.
+        """Compute the least commanded force that holds the box in every case of an uncertainty, and
+        the force of the position-controlled arm that results from it.
 
         Args:
             motion: box motion at n samples.
             uncertainty: ranges of the uncertain quantities.
-            leader: index of the leading arm.
+            leader: index of the position-controlled arm.
             rows: indices of the rows of `worst_cases` to consider; None for all.
 
         Returns:
-            Commanded normal force (n,) [N], and the largest normal force (n,) of the leading arm in
-            any case [N]. Both are infinite at samples where no force holds every case.
+            Commanded normal force (n,) [N], and the largest normal force (n,) of the
+            position-controlled arm in any case [N]. Both are infinite at samples where no force
+            holds the box in every case.
 
         Raises:
             SettingsError: the uncertainty leaves no friction or contact patch.
@@ -330,12 +331,12 @@ class RobustModel:
         """Return indices of the rows of `worst_cases` that need the largest forces at any sample.
 
         For each sample these are `GOVERNING_CASES` cases with the largest commanded forces, and as
-        many in which the leading arm's force exceeds the commanded force most.
+        many in which the position-controlled arm's force exceeds the commanded force most.
 
         Args:
             motion: box motion at n samples.
             uncertainty: ranges of the uncertain quantities.
-            leader: index of the leading arm.
+            leader: index of the position-controlled arm.
         """
         worst = self.least_squeeze(motion, self.worst_cases(uncertainty, leader), leader)
         command = worst[:, :, 1 - leader]
@@ -349,7 +350,7 @@ class RobustModel:
         leader: int = 0,
         above: Array | float = 0.0,
     ) -> Array:
-        """Compute the least commanded normal force (n,) [N] that holds every case of an
+        """Compute the least commanded normal force (n,) [N] that holds the box in every case of an
         uncertainty, in less time than `hold`; infinite at samples where no force does.
 
         At most `SAMPLES` samples are checked in all cases, the others only in the cases that need
@@ -359,7 +360,7 @@ class RobustModel:
         Args:
             motion: box motion at n samples.
             uncertainty: ranges of the uncertain quantities.
-            leader: index of the leading (position-controlled) arm.
+            leader: index of the position-controlled arm.
             above: lower bound of the result, one per sample (n,) or one for all samples [N].
         """
         cases, n = self.worst_cases(uncertainty, leader), len(motion.pose)
@@ -396,7 +397,7 @@ class RobustModel:
         Args:
             motion: box motion at n samples.
             uncertainty: ranges of the uncertain quantities.
-            leader: index of the leading arm.
+            leader: index of the position-controlled arm.
         """
         force, planned = self.commanded(motion, uncertainty, leader), self.nominal(motion, leader)
         share = self.leading_share[leader]
@@ -409,16 +410,16 @@ class RobustModel:
     def robust_force(
         self, motion: HeldMotion, uncertainty: Uncertainty | None = None, leader: int = 0
     ) -> RobustForce:
-        """Compute the least commanded forces that hold in every case of an uncertainty.
+        """Compute the least commanded forces that hold the box in every case of an uncertainty.
 
         Args:
             motion: motion at n samples.
             uncertainty: the ranges of the cases; None for the workcell's.
-            leader: index of the leading arm.
+            leader: index of the position-controlled arm.
 
         Raises:
-            SettingsError: the uncertainty leaves no friction or patch, or no force holds every
-                case.
+            SettingsError: the uncertainty leaves no friction or patch, or no force holds
+                the box in every case.
         """
         chosen = self.workcell.uncertainty if uncertainty is None else uncertainty
         commanded, leading = self.hold(motion, chosen, leader)
@@ -517,7 +518,7 @@ class RobustModel:
         Args:
             motion: box motion.
             limit: (2,) largest allowed normal force of each robot [N].
-            leader: index of the leading arm.
+            leader: index of the position-controlled arm.
 
         Returns:
             Factor from 0 to `LARGEST_FACTOR`; 0 if the forces without uncertainty exceed the

@@ -276,17 +276,18 @@ class GoverningForce:
     def slopes(
         self, low: Workcell, high: Workcell, motions: tuple[BoxMotion, BoxMotion], pads: bool
     ) -> tuple[float, float]:
-        """Compute how much the force changes [N] if one number of the cell is raised or lowered.
+        """Compute how much the largest commanded force changes [N] if one number of the cell is
+        raised or lowered.
 
         Args:
             low, high: cells in which the number is lower, and higher by the same amount, than in
                 this cell.
             motions: box motions in the cell `low` and in the cell `high`, at `samples`.
-            pads: True if the pads of `low` and `high` differ. The forces of pads without opposite
-                normals are then computed anew.
+            pads: True if the pads of `low` and `high` differ. Forces of pads without opposite
+                normals are then computed again.
 
         Returns:
-            Change of the force from this cell to `high`, and from this cell to `low`.
+            Changes of the force from this cell to `high`, and from this cell to `low`.
         """
         before, after = (
             self._inputs(cell, at, pads) for cell, at in zip((low, high), motions, strict=True)

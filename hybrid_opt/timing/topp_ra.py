@@ -193,7 +193,7 @@ class _CuttingPlaneProblem:
         return a / self._scale, w.reshape(-1) / self._scale**2
 
     def _advance(self, squared: Array) -> bool:
-        """Add rows to the next linear program that the timing by the last one violates.
+        """Add the rows that the present timing violates to the next linear program.
 
         Convex limits that the timing exceeds get supporting lines, which exclude the timing. The
         other limits are linearised about it.

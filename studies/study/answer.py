@@ -233,8 +233,8 @@ def _checked(price: RobustPrice) -> str:
     """Return a phrase on the robustness of the recommended carry.
 
     It says how many random cases of the uncertainty slip, which uncertainty this is, the largest
-    force of the leading arm, and which multiple of the uncertainty the reference forces would still
-    hold.
+    force of the position-controlled arm, and which multiple of the uncertainty the reference forces
+    would still hold.
 
     Args:
         price: robust forces of the carry, by multiple of the uncertainty.

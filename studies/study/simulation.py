@@ -71,7 +71,7 @@ class StoredSimulation:
             slipping; null if there is none.
         pad, begins: number of the pad that slips first just below the threshold, 1 or 2, 0 for
             none; and the time at which it begins to slip [s].
-        robust: True if the stored simulation uses forces that hold in every case of the
+        robust: True if the stored simulation uses forces that hold the box in every case of the
             uncertainty.
         factor: factor of the planned forces in the stored simulation; null with robust forces.
         arrives: True if the box did not slip in the stored simulation and ended at its goal.
@@ -279,7 +279,7 @@ def _simulated_hands(
     """Simulate a carry in hands without arms, and return the record to store.
 
     The least factor of the planned forces that holds the payload is found. The stored simulation
-    has the forces that hold in every case of the uncertainty.
+    has the forces that hold the box in every case of the uncertainty.
 
     Args:
         carry: the carry.

@@ -43,7 +43,7 @@ class SoftFinger(ContactModel):
     def problem(self) -> Problem | None:
         """Reason why this contact model does not apply, as (key of the workcell file, message).
 
-        None unless the pads are offset laterally by too much to hold the payload.
+        None if the lateral offset of the pads is small enough to hold the payload.
         """
         friction = min(contact.friction for contact in self.workcell.contacts)
         beside, room = self.workcell.pad_offset, friction * self.workcell.pad_distance

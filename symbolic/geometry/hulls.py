@@ -114,7 +114,7 @@ def _may_be_cut(triangles: Array, filled: float) -> bool:
 
 
 def _warn(path: Path, text: str) -> None:
-    """Warn once that the mesh at `path` is to be corrected, with a text."""
+    """Warn once about the mesh at `path`, with a text that says how to correct it."""
     warnings.warn_explicit(
         text, CollisionModelWarning, filename=path.name, lineno=0, registry=_TOLD
     )

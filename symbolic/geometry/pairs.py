@@ -194,7 +194,8 @@ def build_geometry(workcell: Workcell) -> CellGeometry:
 def _sorted_pairs(
     given: CacheKey,
 ) -> tuple[tuple[ActivePair, ...], tuple[ExcludedPair, ...], tuple[ActivePair, ...], int]:
-    """Sort all pairs of bodies.
+    """Sort all pairs of bodies into active, excluded and possible ones, as defined in
+    `CellGeometry`.
 
     Args:
         given: cache key that holds the workcell, all bodies, both arms' geometry, and the reasons
@@ -202,7 +203,7 @@ def _sorted_pairs(
 
     Returns:
         Active pairs, excluded pairs, possible pairs with the near ones first, and the number of
-        near pairs, as in `CellGeometry`.
+        near pairs.
     """
     workcell, bodies, arms, ignored = given.given
     # Pairs within an arm are sorted as if its root were the world: where it stands does not matter.

@@ -192,7 +192,7 @@ def _build(
 def _digest(content: bytes, workcell: Workcell) -> str:
     """Compute the SHA-256 of a workcell file and of the content of every file that it names.
 
-    The places of the files do not count. The order is: the bytes of the workcell file; for each
+    The paths of the files do not count. The order is: the bytes of the workcell file; for each
     robot its URDF (a xacro file in expanded form), the meshes that the URDF names, and its SRDF;
     the meshes of tools, environment and payload.
 

@@ -251,8 +251,9 @@ def is_xacro(content: bytes) -> bool:
 
 
 def takes_arguments(content: bytes) -> bool:
-    """Return whether `xacro_arguments` may be given for a file: a xacro file, or a description
-    that this project expanded from one."""
+    """Return True if `xacro_arguments` may be given for a file, that is, for a xacro file or a
+    description that this project expanded from one.
+    """
     return is_xacro(content) or f"<!--{_EXPANDED}-->".encode() in content
 
 

@@ -205,7 +205,7 @@ class WorkingSet:
 
     @property
     def rows(self) -> set[Row]:
-        """All rows that the next program has besides those near their bounds."""
+        """All rows (scalar inequalities) of the next program apart from those near their bounds."""
         return {*self._tightened, *self._active_for}
 
     def tighten(self, required: dict[Row, float], x: Array, radius: float) -> None:
