@@ -60,27 +60,27 @@ def mx_symbols(given: Mapping[str, ca.SX]) -> dict[str, ca.MX]:
     return {name: ca.MX.sym(name, symbols.numel()) for name, symbols in given.items()}
 
 
-def select_parameters(handed: Mapping[str, ca.MX], *records: Any) -> dict[str, ca.MX]:
-    """Return those entries of `handed` whose parameter groups occur in the records.
+def select_parameters(groups: Mapping[str, ca.MX], *records: Any) -> dict[str, ca.MX]:
+    """Return those entries of `groups` whose parameter groups occur in the records.
 
     Args:
-        handed: MX vectors by name of the parameter group.
+        groups: MX vectors by name of the parameter group.
         records: records with symbols as parameters, or of plain numbers.
     """
-    return {name: handed[name] for name in sx_parameters(*records)}
+    return {name: groups[name] for name in sx_parameters(*records)}
 
 
-def as_mx(value: ca.SX, given: Mapping[str, ca.SX], handed: Mapping[str, ca.MX]) -> ca.MX:
+def as_mx(value: ca.SX, given: Mapping[str, ca.SX], groups: Mapping[str, ca.MX]) -> ca.MX:
     """Convert an SX expression of parameters to an MX expression.
 
     Args:
         value: SX expression; it depends only on the parameters `given`.
         given: SX vectors of the parameters by group; empty if value is constant.
-        handed: MX vectors by group, from `mx_parameters`, that replace them.
+        groups: MX vectors by group, from `mx_parameters`, that replace them.
     """
     if not given:
         return ca.MX(ca.evalf(value))
-    return ca.Function("numbers", list(given.values()), [value])(*handed.values())
+    return ca.Function("numbers", list(given.values()), [value])(*groups.values())
 
 
 def tile(given: Mapping[str, ca.MX], n: int) -> list[ca.MX]:

@@ -85,16 +85,16 @@ def candidate_function(model: CellModel) -> ca.Function:
     """
     workcell = model.workcell
     n = workcell.task.samples
-    x, basis, handed = ca.MX.sym("x", workcell.task.n_var), sample_basis(workcell.task), _all(model)
+    x, basis, groups = ca.MX.sym("x", workcell.task.n_var), sample_basis(workcell.task), _all(model)
     inputs = {"x": x}
-    waypoints, own = _waypoints(workcell.task, x, handed), select_parameters(handed, workcell.task)
+    waypoints, own = _waypoints(workcell.task, x, groups), select_parameters(groups, workcell.task)
     if workcell.task.law.is_drivable:
         inputs |= {name: ca.MX.sym(name, n) for name in DRIVE_INPUTS}
         path = driven_path(basis, waypoints, *[inputs[name].T for name in DRIVE_INPUTS])
     else:
-        path = timed_path(workcell.task, basis, waypoints, handed=own)
-    inputs |= handed
-    held = tile(select_parameters(handed, workcell.payload), n)
+        path = timed_path(workcell.task, basis, waypoints, groups=own)
+    inputs |= groups
+    held = tile(select_parameters(groups, workcell.payload), n)
     found = load_function(workcell).map(n)(path.pose, path.rate, path.second_rate, *held)
     load = dict(zip(LOAD_OUTPUTS, found, strict=True))
     outputs: dict[str, ca.MX] = {
@@ -107,9 +107,9 @@ def candidate_function(model: CellModel) -> ca.Function:
     whole = extended_matrix(workcell.task, x, waypoints, own)
     pose = ca.mtimes(whole, ca.DM(basis.position.T))
     for i in (0, 1):
-        tracked = _track(model, i, pose, load[f"wrench_{i + 1}"], handed)
+        tracked = _track(model, i, pose, load[f"wrench_{i + 1}"], groups)
         outputs |= {f"{name}_{i + 1}": tracked[name] for name in TRACK_OUTPUTS}
-    constraint = _constraints(workcell, outputs, n, handed)
+    constraint = _constraints(workcell, outputs, n, groups)
     violated = ca.fmax(constraint, 0.0)
     outputs["constraint"] = constraint
     outputs["violation"] = _row_max(violated)
@@ -124,12 +124,12 @@ def _all(model: CellModel) -> dict[str, ca.MX]:
     return mx_parameters(workcell.task, *workcell.robots, model, workcell.payload)
 
 
-def _waypoints(task: Task, x: ca.MX, handed: dict[str, ca.MX]) -> ca.MX:
-    return waypoint_matrix(task, x, select_parameters(handed, task))
+def _waypoints(task: Task, x: ca.MX, groups: dict[str, ca.MX]) -> ca.MX:
+    return waypoint_matrix(task, x, select_parameters(groups, task))
 
 
 def _constraints(
-    workcell: Workcell, values: dict[str, ca.MX], n: int, handed: dict[str, ca.MX]
+    workcell: Workcell, values: dict[str, ca.MX], n: int, groups: dict[str, ca.MX]
 ) -> ca.MX:
     """Build the constraint values (9, n) at n samples, one row for each of `CONSTRAINTS`. A value
     is at most 0 where the sample satisfies the constraint.
@@ -138,9 +138,9 @@ def _constraints(
         workcell: cell with symbolic parameters.
         values: quantities (rows, n) at the samples by name, at least those in `_CONSTRAINT_INPUTS`.
         n: number of samples.
-        handed: the cell's symbolic parameters by name of their group.
+        groups: MX vectors of the cell's parameters, by name of the parameter group.
     """
-    numbers = tile(select_parameters(handed, *workcell.robots, workcell.payload), n)
+    numbers = tile(select_parameters(groups, *workcell.robots, workcell.payload), n)
     inputs = [values[name] for name in _CONSTRAINT_INPUTS]
     return _constraint_function(workcell).map(n)(*inputs, *numbers)
 
@@ -154,16 +154,16 @@ def motion_function(model: CellModel) -> ca.Function:
     """
     workcell = model.workcell
     n = workcell.task.samples
-    x, basis, handed = ca.MX.sym("x", workcell.task.n_var), sample_basis(workcell.task), _all(model)
-    waypoints, own = _waypoints(workcell.task, x, handed), select_parameters(handed, workcell.task)
-    path = timed_path(workcell.task, basis, waypoints, handed=own)
+    x, basis, groups = ca.MX.sym("x", workcell.task.n_var), sample_basis(workcell.task), _all(model)
+    waypoints, own = _waypoints(workcell.task, x, groups), select_parameters(groups, workcell.task)
+    path = timed_path(workcell.task, basis, waypoints, groups=own)
     whole = extended_matrix(workcell.task, x, waypoints, own)
     pose = ca.mtimes(whole, ca.DM(basis.position.T))
     values = {name: ca.DM.zeros(2, n) for name in _CONSTRAINT_INPUTS[-3:]}
     for i in (0, 1):
-        tracked = _track(model, i, pose, ca.DM.zeros(6, n), handed)
+        tracked = _track(model, i, pose, ca.DM.zeros(6, n), groups)
         values |= {f"{name}_{i + 1}": tracked[name] for name in TRACK_OUTPUTS}
-    constraint = _constraints(workcell, values, n, handed)
+    constraint = _constraints(workcell, values, n, groups)
     outputs = {
         "time": path.time,
         "pose": path.pose,
@@ -171,7 +171,7 @@ def motion_function(model: CellModel) -> ca.Function:
         "q_2": values["q_2"],
         "violation": _row_max(ca.fmax(constraint, 0.0)),
     }
-    return named_function("motion_alone", {"x": x} | handed, outputs)
+    return named_function("motion_alone", {"x": x} | groups, outputs)
 
 
 _LOAD_SIZES = {
@@ -242,14 +242,14 @@ def sample_functions(model: CellModel) -> dict[str, ca.Function]:
     The last inputs of each function are the parameter groups that `kernel_numbers` names.
     """
     workcell = model.workcell
-    x, basis, handed = ca.MX.sym("x", workcell.task.n_var), sample_basis(workcell.task), _all(model)
+    x, basis, groups = ca.MX.sym("x", workcell.task.n_var), sample_basis(workcell.task), _all(model)
     own, held = (
-        select_parameters(handed, workcell.task),
-        select_parameters(handed, workcell.payload),
+        select_parameters(groups, workcell.task),
+        select_parameters(groups, workcell.payload),
     )
-    arms = select_parameters(handed, *workcell.robots)
-    waypoints = _waypoints(workcell.task, x, handed)
-    path = timed_path(workcell.task, basis, waypoints, handed=own)
+    arms = select_parameters(groups, *workcell.robots)
+    waypoints = _waypoints(workcell.task, x, groups)
+    path = timed_path(workcell.task, basis, waypoints, groups=own)
     extended = extended_matrix(workcell.task, x, waypoints, own)
     whole = ca.mtimes(extended, ca.DM(basis.position.T))
     motion = [path.time, whole, path.rate, path.second_rate]
@@ -263,7 +263,7 @@ def sample_functions(model: CellModel) -> dict[str, ca.Function]:
     begins = [ca.MX.sym(f"begin_{i + 1}", arm.n_joints) for i, arm in enumerate(model.robots)]
     for i in (0, 1):
         arm = (workcell.robots[i], model.robots[i], workcell.contacts[i])
-        given = select_parameters(handed, workcell.robots[i]).values()
+        given = select_parameters(groups, workcell.robots[i]).values()
         starts.append(start_function(*arm, f"arm_{i + 1}_start")(begins[i], pose, *given))
         state = ca.MX.sym(f"state_{i + 1}", starts[i].shape[0])
         states.append(state)
@@ -275,7 +275,7 @@ def sample_functions(model: CellModel) -> dict[str, ca.Function]:
         }
         predict = prediction_function(*arm, f"arm_{i + 1}_prediction")
         predicted.append(predict(state, pose, *given))
-    outputs["constraint"] = _constraints(workcell, outputs, 1, handed)
+    outputs["constraint"] = _constraints(workcell, outputs, 1, groups)
     sizes = sample_sizes(workcell)
     results = [*following, *(outputs[name] for name in sizes)]
     names = ["next_state_1", "next_state_2", *sizes]
@@ -285,7 +285,7 @@ def sample_functions(model: CellModel) -> dict[str, ca.Function]:
         "start": ca.Function("start", [pose, *begins, *arms.values()], starts),
         "predict": ca.Function("predict", [*states, pose, *arms.values()], predicted),
         "sample": ca.Function("sample", asked, results, [v.name() for v in asked], names),
-        **({"forces": _forces_function(model, (pose, *box[1:]), load, handed)} if apart else {}),
+        **({"forces": _forces_function(model, (pose, *box[1:]), load, groups)} if apart else {}),
     }
 
 
@@ -312,7 +312,7 @@ def _forces_function(
     model: CellModel,
     motion: tuple[ca.MX, ...],
     load: dict[str, ca.MX],
-    handed: dict[str, ca.MX],
+    groups: dict[str, ca.MX],
 ) -> ca.Function:
     """Build the function `forces` that `sample_functions` describes: contact forces, joint torques
     and their constraints at one sample.
@@ -322,7 +322,7 @@ def _forces_function(
         motion: symbols of the extended pose, and of the first and second time derivative (6,) of
             the box pose.
         load: expressions of the outputs `symbolic.contact.load.LOAD_OUTPUTS`, by name.
-        handed: symbolic parameters of the cell, by group.
+        groups: MX vectors of the cell's parameters, by name of the parameter group.
     """
     workcell = model.workcell
     joints = [ca.MX.sym(f"q_{i + 1}", model.robots[i].n_joints) for i in (0, 1)]
@@ -331,30 +331,30 @@ def _forces_function(
         arm = (workcell.robots[i], model.robots[i], workcell.contacts[i])
         torque, own = (
             torque_function(*arm, f"arm_{i + 1}_torque"),
-            select_parameters(handed, arm[0]).values(),
+            select_parameters(groups, arm[0]).values(),
         )
         outputs[f"joint_torque_{i + 1}"] = torque(q, motion[0], load[f"wrench_{i + 1}"], *own)
     known = dict.fromkeys(_CONSTRAINT_INPUTS[:-3], ca.DM.zeros(1))
-    constraint = _constraints(workcell, outputs | known, 1, handed)
+    constraint = _constraints(workcell, outputs | known, 1, groups)
     outputs["force_constraint"] = constraint[-len(FORCE_CONSTRAINTS) :]
     names = list(force_sizes(workcell))
     given = [
         *motion,
         *joints,
-        *select_parameters(handed, *workcell.robots, workcell.payload).values(),
+        *select_parameters(groups, *workcell.robots, workcell.payload).values(),
     ]
     results = [outputs[name] for name in names]
     return ca.Function("forces", given, results, [v.name() for v in given], names)
 
 
 def _track(
-    model: CellModel, i: int, pose: ca.MX, wrench: ca.MX, handed: dict[str, ca.MX]
+    model: CellModel, i: int, pose: ca.MX, wrench: ca.MX, groups: dict[str, ca.MX]
 ) -> dict[str, ca.MX]:
     robot, contact = model.workcell.robots[i], model.workcell.contacts[i]
     n = model.workcell.task.samples
     follow = follow_function(robot, model.robots[i], contact, n, f"arm_{i + 1}")
-    start = start_posture(model, i, handed)
-    results = follow(start, pose, wrench, *select_parameters(handed, robot).values())
+    start = start_posture(model, i, groups)
+    results = follow(start, pose, wrench, *select_parameters(groups, robot).values())
     return dict(zip(TRACK_OUTPUTS, results, strict=True))
 
 

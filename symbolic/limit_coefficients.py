@@ -69,24 +69,24 @@ def path_function(model: CellModel, samples: int) -> ca.Function:
     """
     workcell = model.workcell
     x, task = ca.MX.sym("x", workcell.task.n_path), workcell.task
-    handed = mx_parameters(task, *workcell.robots, model)
-    waypoints = waypoint_matrix(task, x, select_parameters(handed, task))
+    groups = mx_parameters(task, *workcell.robots, model)
+    waypoints = waypoint_matrix(task, x, select_parameters(groups, task))
     basis = path_basis(len(task.waypoints), np.linspace(0.0, 1.0, samples))
-    moved = extended_motion(task, x, basis, waypoints, select_parameters(handed, task))
+    moved = extended_motion(task, x, basis, waypoints, select_parameters(groups, task))
     outputs = dict(zip(PATH_OUTPUTS, moved, strict=False))
     no_wrench = ca.DM.zeros(6, samples)
     verdicts: dict[str, ca.MX] = {}
     for i, (robot, contact) in enumerate(zip(workcell.robots, workcell.contacts, strict=True)):
         follow = follow_function(robot, model.robots[i], contact, samples, f"limits_arm_{i + 1}")
-        start = start_posture(model, i, handed)
+        start = start_posture(model, i, groups)
         results = follow(
-            start, outputs["pose"], no_wrench, *select_parameters(handed, robot).values()
+            start, outputs["pose"], no_wrench, *select_parameters(groups, robot).values()
         )
         tracked = dict(zip(TRACK_OUTPUTS, results, strict=True))
         outputs[f"q_{i + 1}"] = tracked["q"]
         verdicts |= {f"{name}_{i + 1}": tracked[name] for name in ARM_CHECK_OUTPUTS}
     outputs |= verdicts
-    return named_function("path", {"x": x} | handed, outputs)
+    return named_function("path", {"x": x} | groups, outputs)
 
 
 def sample_limits_function(model: CellModel) -> ca.Function:
@@ -192,13 +192,13 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     sizes = limit_layout(workcell).sizes
     names = ("limit_forces", "limit_force_slopes")
     if not contact_model(workcell).has_closed_form:
-        handed = mx_parameters(workcell.payload)
+        groups = mx_parameters(workcell.payload)
         asked = [ca.MX.sym("asked", sizes["force"] + sizes["moment"]), *map(ca.MX.sym, "aw")]
-        asked += handed.values()
+        asked += groups.values()
         load, by_timing = _load_function(workcell)(*asked)
         soft = SoftGrasp(Grasp(workcell), TIMING_BARRIER_WEIGHT)
-        found, state = soft.solve(load, handed), ca.MX.sym("solved", soft.size)
-        normal, slope = soft.slopes()(state, *handed.values())
+        found, state = soft.solve(load, groups), ca.MX.sym("solved", soft.size)
+        normal, slope = soft.slopes()(state, *groups.values())
         slopes = ca.horzsplit(ca.mtimes(slope.T, by_timing))
         alone = ca.densify(ca.mtimes(soft.normals, found))
         return (
@@ -347,9 +347,9 @@ def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     own, by_wrench = ca.reshape(torque, joints, 3), ca.reshape(wrench, 6, joints).T
     # Each arm's joints feel its own wrench.
     first, grasp = workcell.robots[0].velocity_max.shape[0], Grasp(workcell)
-    handed = mx_parameters(workcell.payload)
-    given = list(handed.values())
-    felt = as_mx(ca.SX(number(grasp.numbers.to_robots)), grasp.given, handed)
+    groups = mx_parameters(workcell.payload)
+    given = list(groups.values())
+    felt = as_mx(ca.SX(number(grasp.numbers.to_robots)), grasp.given, groups)
     # The pads of the first robot come first.
     others = WRENCH_SIZE * grasp.robots.index(1)
     _, by_timing = _load_function(workcell)(asked, *inputs[1:], *given)

@@ -24,8 +24,8 @@ from symbolic.expression import (
 )
 from symbolic.path.rotation import angular_acceleration, angular_velocity, rotation_matrix
 from symbolic.path.spline import (
-    NONE,
-    Handed,
+    NO_GROUPS,
+    MXGroups,
     PathBasis,
     extended_matrix,
     path_basis,
@@ -89,24 +89,24 @@ def path_motion_function(model: CellModel, samples: int) -> ca.Function:
     """
     workcell = model.workcell
     x, task = ca.MX.sym("x", workcell.task.n_var), workcell.task
-    handed = mx_parameters(task, *workcell.robots, model, workcell.payload)
-    waypoints = waypoint_matrix(task, x, select_parameters(handed, task))
+    groups = mx_parameters(task, *workcell.robots, model, workcell.payload)
+    waypoints = waypoint_matrix(task, x, select_parameters(groups, task))
     basis = path_basis(len(task.waypoints), np.linspace(0.0, 1.0, samples))
     pose, first, second = (
         ca.mtimes(waypoints, ca.DM(matrix.T))
         for matrix in (basis.position, basis.first, basis.second)
     )
     outputs = {"pose": pose, "pose_first": first, "pose_second": second}
-    held = tile(select_parameters(handed, workcell.payload), samples)
+    held = tile(select_parameters(groups, workcell.payload), samples)
     box = box_function(workcell).map(samples)(pose, first, second, *held)
     outputs |= dict(zip(BOX_OUTPUTS, box, strict=True))
     no_wrench = ca.DM.zeros(6, samples)
-    moved = extended_motion(task, x, basis, waypoints, select_parameters(handed, task))
+    moved = extended_motion(task, x, basis, waypoints, select_parameters(groups, task))
     for i in (0, 1):
         robot, contact = workcell.robots[i], workcell.contacts[i]
         follow = follow_function(robot, model.robots[i], contact, samples, f"path_arm_{i + 1}")
-        given = select_parameters(handed, robot)
-        start = start_posture(model, i, handed)
+        given = select_parameters(groups, robot)
+        start = start_posture(model, i, groups)
         found = follow(start, moved[0], no_wrench, *given.values())
         tracked = dict(zip(TRACK_OUTPUTS, found, strict=True))
         del tracked["joint_torque"]
@@ -114,28 +114,28 @@ def path_motion_function(model: CellModel, samples: int) -> ca.Function:
         derivatives = arm.map(samples)(tracked["q"], *moved, *tile(given, samples))
         derived = dict(zip(ARM_OUTPUTS, derivatives, strict=True))
         outputs |= {f"{name}_{i + 1}": value for name, value in (tracked | derived).items()}
-    return named_function("path_motion", {"x": x} | handed, outputs)
+    return named_function("path_motion", {"x": x} | groups, outputs)
 
 
-def start_posture(model: CellModel, arm: int, handed: Handed) -> ca.MX:
+def start_posture(model: CellModel, arm: int, groups: MXGroups) -> ca.MX:
     """Return the joint positions (n,) [rad or m] of an arm at the start of the path.
 
     Args:
         model: the cell.
         arm: index of the arm.
-        handed: MX inputs that hold the cell's symbolic parameters, by group; empty for plain
+        groups: MX vectors of the cell's parameters, by name of the parameter group; empty for plain
             numbers.
     """
     start = model.start[arm]
     return (
-        as_mx(start, sx_parameters(model), select_parameters(handed, model))
-        if handed
+        as_mx(start, sx_parameters(model), select_parameters(groups, model))
+        if groups
         else ca.MX(ca.DM(start))
     )
 
 
 def extended_motion(
-    task: Task, x: ca.MX, basis: PathBasis, waypoints: ca.MX, handed: Handed = NONE
+    task: Task, x: ca.MX, basis: PathBasis, waypoints: ca.MX, groups: MXGroups = NO_GROUPS
 ) -> list[ca.MX]:
     """Compute the extended poses (box pose, then redundant joints) at n samples of the path, and
     their first and second derivatives by u.
@@ -145,12 +145,13 @@ def extended_motion(
         x: (n_var,) decision vector.
         basis: spline basis at the n samples.
         waypoints: (6, n_waypoints) box poses at the waypoints [m, rad].
-        handed: inputs that hold the task's parameters, by group; empty for plain numbers.
+        groups: MX vectors of the task's parameters, by name of the parameter group; empty for plain
+            numbers.
 
     Returns:
         Three matrices (6 + m, n), one sample per column.
     """
-    whole = extended_matrix(task, x, waypoints, handed)
+    whole = extended_matrix(task, x, waypoints, groups)
     matrices = (basis.position, basis.first, basis.second)
     return [ca.mtimes(whole, ca.DM(matrix.T)) for matrix in matrices]
 

@@ -154,7 +154,7 @@ def commanded_forces(
     friction: ca.MX,
     share: ca.MX,
     displacement: ca.MX,
-    handed: dict[str, ca.MX] | None = None,
+    groups: dict[str, ca.MX] | None = None,
     differentiable: bool = False,
 ) -> ca.MX:
     """Build the expression of the robots' normal forces (2,) [N]: the least commanded force of one
@@ -168,14 +168,14 @@ def commanded_forces(
         share: (2,) sizes of the robots' patches over the cell's own sizes.
         displacement: (4,) displacements of the first, then of the second robot's pads along their
             tangents [m].
-        handed: MX vectors in place of the convex program's symbolic parameters, by group; None if
+        groups: MX vectors in place of the convex program's symbolic parameters, by group; None if
             it has none.
         differentiable: True for exact first derivatives.
     """
-    handed = handed or {}
-    reach = share / as_mx(ca.SX(number(squeeze.numbers.reach)), squeeze.given, handed)
+    groups = groups or {}
+    reach = share / as_mx(ca.SX(number(squeeze.numbers.reach)), squeeze.given, groups)
     cell = [load, friction, reach, displacement]
-    return squeeze.solve(cell, list(handed.values()), differentiable)
+    return squeeze.solve(cell, list(groups.values()), differentiable)
 
 
 def commanded_slack(

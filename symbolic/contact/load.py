@@ -153,16 +153,16 @@ def _grasp_load_function(workcell: Workcell) -> ca.Function:
     inputs = {name: ca.MX.sym(name, size) for name, size in SIZES.items()}
     names = ("angular_velocity", "angular_acceleration", "force", "required_moment")
     given = [ca.SX.sym(name, size) for name, size in SIZES.items() if name != "friction"]
-    numbers, handed = sx_parameters(workcell.payload), mx_parameters(workcell.payload)
+    numbers, groups = sx_parameters(workcell.payload), mx_parameters(workcell.payload)
     of_motion = required(workcell, *given)[1:]
     asked_of = [inputs[name] for name in SIZES if name != "friction"]
     function = ca.Function("required", [*given, *numbers.values()], of_motion)
-    found = function(*asked_of, *handed.values())
+    found = function(*asked_of, *groups.values())
     outputs = dict(zip(names, found, strict=True))
     asked = (inputs["pose"], outputs["force"], outputs["required_moment"])
-    further = (inputs["friction"], inputs["centre_of_mass"], *handed.values())
+    further = (inputs["friction"], inputs["centre_of_mass"], *groups.values())
     outputs |= dict(zip(GRASP_OUTPUTS, _sample_function(workcell)(*asked, *further), strict=True))
-    return _named(inputs | handed, outputs)
+    return _named(inputs | groups, outputs)
 
 
 def _named(inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:

@@ -62,22 +62,22 @@ class SoftGrasp:
         m]. Outputs: normal (2,), normal forces of the robots [N]; slope (6, 2), their derivatives
         by the load; state (size,) of all patches.
         """
-        load, handed = ca.MX.sym("load", LOAD_SIZE), mx_symbols(self.grasp.given)
-        state = self.solve(load, handed)
-        outputs = [*self.slopes()(state, *handed.values()), state]
-        inputs, names = [load, *handed.values()], ["load", *handed]
+        load, groups = ca.MX.sym("load", LOAD_SIZE), mx_symbols(self.grasp.given)
+        state = self.solve(load, groups)
+        outputs = [*self.slopes()(state, *groups.values()), state]
+        inputs, names = [load, *groups.values()], ["load", *groups]
         return ca.Function("held_first", inputs, outputs, names, ["normal", "slope", "state"])
 
-    def solve(self, load: ca.MX, handed: dict[str, ca.MX]) -> ca.MX:
+    def solve(self, load: ca.MX, groups: dict[str, ca.MX]) -> ca.MX:
         """Build the expression of those states (size,) of all patches that balance a load with the
         least effort.
 
         Args:
             load: (6,) force and moment about the box frame's origin, along the box's axes [N, N m].
-            handed: symbolic parameters of the grasp by group.
+            groups: MX vectors of the grasp's parameters, by name of the parameter group.
         """
-        given = list(handed.values())
-        friction = as_mx(self.grasp.friction, self.grasp.given, handed)
+        given = list(groups.values())
+        friction = as_mx(self.grasp.friction, self.grasp.given, groups)
         scale = ca.sqrt(ca.sumsqr(load[:3]) + ca.sumsqr(load[3:] / MOMENT_ARM) + SCALE_FLOOR**2)
         state = scale * centred(self.grasp, self.weight)(load / scale, friction, *given)
         step = self._newton()

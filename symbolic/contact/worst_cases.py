@@ -271,10 +271,10 @@ def _least_force(
     case = inputs["case"]
     friction, *_ = case_parts(case)
     if squeeze is not None:
-        handed = {name: inputs[name] for name in squeeze.given}
+        groups = {name: inputs[name] for name in squeeze.given}
         load = _origin_load(workcell, inputs)
         load = load if isinstance(beside, float) else load + beside
-        return _commanded_by_program(squeeze, load, case, handed, differentiable)
+        return _commanded_by_program(squeeze, load, case, groups, differentiable)
     model, load = command_model(workcell), case_contact_load(workcell, inputs)
     *_, tracking, opposed = case_parts(case)
     held = model.hold(load, implicit, displaced)
@@ -347,7 +347,7 @@ def _commanded_by_program(
     squeeze: GraspSqueeze,
     load: ca.MX,
     case: ca.MX,
-    handed: dict[str, ca.MX],
+    groups: dict[str, ca.MX],
     differentiable: bool = False,
 ) -> ca.MX:
     """Build the expression of the normal forces (2,) to command [N] for pads with any normals.
@@ -356,17 +356,17 @@ def _commanded_by_program(
         squeeze: convex program of the least commanded force.
         load: (6,) force and moment about the box frame's origin, along the box's axes [N, N m].
         case: (18,) case of the uncertainty, laid out by `CASE_SIZES`.
-        handed: symbolic parameters of the cell by group.
+        groups: MX vectors of the cell's parameters, by name of the parameter group.
         differentiable: True for exact first derivatives.
     """
     friction, *_, displacement, tracking, internal = case_parts(case)
-    commanded, given = squeeze.commanded, list(handed.values())
+    commanded, given = squeeze.commanded, list(groups.values())
     sizes = _sizes_function(squeeze)(case, *given)
-    force = commanded_forces(squeeze, load, friction, sizes, displacement, handed, differentiable)
+    force = commanded_forces(squeeze, load, friction, sizes, displacement, groups, differentiable)
     needed = force[commanded] + internal * internal_force_gain(squeeze)(friction, sizes, *given)
     more = needed / (1.0 - tracking[commanded]) - force[commanded]
     normals = squeeze.normals
-    shares = as_mx(normals / normals[commanded], squeeze.given, handed)
+    shares = as_mx(normals / normals[commanded], squeeze.given, groups)
     # Entry by entry: CasADi repeats a scalar times a vector by an operation without lanes.
     force += ca.vertcat(*[more * shares[i] for i in (0, 1)])
     return force

@@ -92,35 +92,36 @@ def sample_basis(task: Task) -> PathBasis:
     return path_basis(len(task.waypoints), np.linspace(0.0, 1.0, task.samples))
 
 
-Handed = Mapping[str, ca.MX]
-NONE: Handed = MappingProxyType({})
+MXGroups = Mapping[str, ca.MX]
+NO_GROUPS: MXGroups = MappingProxyType({})
 """Empty mapping: the cell's numbers are constants, not inputs
 (`symbolic.expression.mx_parameters`)."""
 
 
-def _fixed(task: Task, value: Any, x: Expression, handed: Handed) -> Expression:
+def _fixed(task: Task, value: Any, x: Expression, groups: MXGroups) -> Expression:
     """Return a parameter of the task as an expression of the type of the decision vector, SX or MX.
 
     Args:
         task: the task.
         value: number or symbolic expression of the parameter.
         x: decision vector, whose type the result has.
-        handed: MX inputs that hold the task's symbolic parameters, by group; empty for plain
+        groups: MX vectors of the task's parameters, by name of the parameter group; empty for plain
             numbers.
     """
     if isinstance(x, ca.MX) and isinstance(value, ca.SX):
-        return as_mx(value, sx_parameters(task), handed)
+        return as_mx(value, sx_parameters(task), groups)
     return type(x)(number(value))
 
 
-def waypoint_matrix(task: Task, x: Expression, handed: Handed = NONE) -> Expression:
+def waypoint_matrix(task: Task, x: Expression, groups: MXGroups = NO_GROUPS) -> Expression:
     """Compute the box poses at all waypoints from the decision vector, with unwrapped angles (paper
     Eq. 17).
 
     Args:
         task: task that states the fixed waypoints.
         x: (n_var,) decision vector; it starts with the poses of the free waypoints in path order.
-        handed: inputs (MX) that hold the task's parameters, by group; empty for plain numbers.
+        groups: MX vectors of the task's parameters, by name of the parameter group; empty for plain
+            numbers.
 
     Returns:
         (6, n_waypoints) box poses: positions [m], orientations [rad].
@@ -129,7 +130,7 @@ def waypoint_matrix(task: Task, x: Expression, handed: Handed = NONE) -> Express
     taken = 0
     for waypoint in task.waypoints:
         if waypoint.is_fixed:
-            columns.append(_fixed(task, waypoint.lower, x, handed))
+            columns.append(_fixed(task, waypoint.lower, x, groups))
         else:
             columns.append(x[6 * taken : 6 * taken + 6])
             taken += 1
@@ -142,7 +143,7 @@ def waypoint_matrix(task: Task, x: Expression, handed: Handed = NONE) -> Express
 
 
 def extended_matrix(
-    task: Task, x: Expression, waypoints: Expression, handed: Handed = NONE
+    task: Task, x: Expression, waypoints: Expression, groups: MXGroups = NO_GROUPS
 ) -> Expression:
     """Compute the box poses at all waypoints, with the positions of the redundant joints below
     them.
@@ -151,7 +152,8 @@ def extended_matrix(
         task: task with m redundant joints.
         x: (n_var,) decision vector.
         waypoints: (6, n_waypoints) box poses from `waypoint_matrix`.
-        handed: inputs (MX) that hold the task's parameters, by group; empty for plain numbers.
+        groups: MX vectors of the task's parameters, by name of the parameter group; empty for plain
+            numbers.
 
     Returns:
         (6 + m, n_waypoints) box poses [m, rad] and redundant joint positions [rad or m].
@@ -162,7 +164,7 @@ def extended_matrix(
     for joint in task.redundant:
         row = []
         for k, moves in enumerate(joint.moving.tolist()):
-            row.append(x[at] if moves else _fixed(task, joint.lower[k], x, handed))
+            row.append(x[at] if moves else _fixed(task, joint.lower[k], x, groups))
             at += int(moves)
         rows.append(row)
     # Column by column, a form that code for lanes knows.

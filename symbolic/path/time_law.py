@@ -20,7 +20,7 @@ import casadi as ca
 
 from symbolic.expression import sx_parameters, tile
 from symbolic.path.rotation import angular_acceleration, angular_velocity
-from symbolic.path.spline import NONE, Handed, PathBasis
+from symbolic.path.spline import NO_GROUPS, MXGroups, PathBasis
 from symbolic.records import Task
 
 LENGTH_FLOOR = 1e-10
@@ -56,7 +56,7 @@ def timed_path(
     basis: PathBasis,
     waypoints: ca.MX,
     rounding: ca.MX | None = None,
-    handed: Handed = NONE,
+    groups: MXGroups = NO_GROUPS,
 ) -> TimedPath:
     """Compute the box motion at the samples of `basis` by the task's time law, `constant` or
     `ramped`.
@@ -67,14 +67,15 @@ def timed_path(
         waypoints: (6, n_waypoints) box poses from `symbolic.path.spline.waypoint_matrix`.
         rounding: relative width that smooths the maximum of translation and rotation time in the
             `constant` law; None for the exact maximum.
-        handed: inputs (MX) that hold the task's parameters, by group; empty for plain numbers.
+        groups: MX vectors of the task's parameters, by name of the parameter group; empty for plain
+            numbers.
     """
     pose = ca.mtimes(waypoints, ca.DM(basis.position.T))
     if task.law.has_differences:
-        return _constant(task, pose, rounding, handed)
+        return _constant(task, pose, rounding, groups)
     first = ca.mtimes(waypoints, ca.DM(basis.first.T))
     second = ca.mtimes(waypoints, ca.DM(basis.second.T))
-    return _ramped(task, basis, (pose, first, second), handed)
+    return _ramped(task, basis, (pose, first, second), groups)
 
 
 def driven_path(
@@ -112,11 +113,11 @@ def _along(
     return TimedPath(time, pose, first * ca.mtimes(rows, speed), pushed)
 
 
-def _constant(task: Task, pose: ca.MX, rounding: ca.MX | None, handed: Handed) -> TimedPath:
+def _constant(task: Task, pose: ca.MX, rounding: ca.MX | None, groups: MXGroups) -> TimedPath:
     count = pose.shape[1] - 1
     step = _step_time_function(task, rounding is not None).map(count)
     rounded = [] if rounding is None else [ca.repmat(rounding, 1, count)]
-    durations = step(pose[:, :-1], pose[:, 1:], *rounded, *tile(handed, count))
+    durations = step(pose[:, :-1], pose[:, 1:], *rounded, *tile(groups, count))
     time = ca.horzcat(0.0, ca.cumsum(durations, 1))
     rate = _gradient(pose, durations)
     return TimedPath(time, pose, rate, _gradient(rate, durations))
@@ -187,11 +188,11 @@ def _one_sided(here: ca.MX, near: ca.MX, far: ca.MX, near_step: ca.MX, far_step:
 
 
 def _ramped(
-    task: Task, basis: PathBasis, along: tuple[ca.MX, ca.MX, ca.MX], handed: Handed
+    task: Task, basis: PathBasis, along: tuple[ca.MX, ca.MX, ca.MX], groups: MXGroups
 ) -> TimedPath:
     pose, first, second = along
     n = pose.shape[1]
-    given = tile(handed, n)
+    given = tile(groups, n)
     slope, curvature = _length_rate_function(task).map(n)(pose, first, second, *given)
     width = float(basis.parameter[1] - basis.parameter[0])
     # Trapezoid with end correction: fourth order in the sample width.

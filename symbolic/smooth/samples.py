@@ -203,14 +203,14 @@ def _window_functions(
     task = workcell.task
     n_waypoints = len(task.waypoints)
     x, basis = ca.MX.sym("x", task.n_var), ca.MX.sym("basis", n_waypoints, DIFFERENCE_WINDOW)
-    rounding, handed = ca.MX.sym("rounding"), mx_parameters(task, workcell.payload)
+    rounding, groups = ca.MX.sym("rounding"), mx_parameters(task, workcell.payload)
     # The window's poses are handed to the time law as waypoints of an identity basis.
     identity = np.eye(DIFFERENCE_WINDOW)
-    window = ca.mtimes(waypoint_matrix(task, x, select_parameters(handed, task)), basis)
+    window = ca.mtimes(waypoint_matrix(task, x, select_parameters(groups, task)), basis)
     own = PathBasis(np.linspace(0.0, 1.0, DIFFERENCE_WINDOW), identity, identity, identity)
     wrench = _wrench_function(workcell)
-    wrenches = _at_samples(workcell, wrench, (own, window, rounding), columns, handed)
-    flat = ca.Function("wrenches", [x, basis, rounding, *handed.values()], [wrenches]).expand()
+    wrenches = _at_samples(workcell, wrench, (own, window, rounding), columns, groups)
+    flat = ca.Function("wrenches", [x, basis, rounding, *groups.values()], [wrenches]).expand()
     inputs = [ca.SX.sym(name, *flat.size_in(k)) for k, name in enumerate(INPUTS)]
     given = sx_parameters(task, workcell.payload)
     wrenches, held = flat(*inputs, *given.values()), sx_parameters(workcell.payload).values()
@@ -223,14 +223,14 @@ def _whole_path(
 ) -> dict[str, ca.Function]:
     task = workcell.task
     x, unused = ca.MX.sym("x", task.n_var), ca.MX.sym("basis", len(task.waypoints), task.samples)
-    rounding, handed = ca.MX.sym("rounding"), mx_parameters(task, workcell.payload)
+    rounding, groups = ca.MX.sym("rounding"), mx_parameters(task, workcell.payload)
     every, wrench = tuple(range(task.samples)), _wrench_function(workcell)
     motion = [ca.SX.sym(name, 6) for name in MOTION_INPUTS]
     held = sx_parameters(workcell.payload).values()
     whole = ca.Function("sample", [*motion, *held], [sample(wrench(*motion, *held), *held)])
-    waypoints = waypoint_matrix(task, x, select_parameters(handed, task))
-    values = _at_samples(workcell, whole, (sample_basis(task), waypoints, None), every, handed)
-    return _functions(values, [x, unused, rounding], handed, quantity, "path")
+    waypoints = waypoint_matrix(task, x, select_parameters(groups, task))
+    values = _at_samples(workcell, whole, (sample_basis(task), waypoints, None), every, groups)
+    return _functions(values, [x, unused, rounding], groups, quantity, "path")
 
 
 def _at_samples(
@@ -238,7 +238,7 @@ def _at_samples(
     of_motion: ca.Function,
     along: tuple[PathBasis, ca.MX, ca.MX | None],
     columns: tuple[int, ...],
-    handed: dict[str, ca.MX],
+    groups: dict[str, ca.MX],
 ) -> ca.MX:
     """Build the expression of a quantity at chosen samples of a path, as one column.
 
@@ -249,13 +249,13 @@ def _at_samples(
         along: arguments of `timed_path`: spline basis, waypoints (6, n_waypoints), and relative
             width of the rounding, None for none.
         columns: indices of the chosen samples among those of the basis.
-        handed: parameters of task and payload by group.
+        groups: MX vectors of the parameters of task and payload, by name of the parameter group.
     """
     path, at = (
-        timed_path(workcell.task, *along, select_parameters(handed, workcell.task)),
+        timed_path(workcell.task, *along, select_parameters(groups, workcell.task)),
         list(columns),
     )
-    held = tile(select_parameters(handed, workcell.payload), len(at))
+    held = tile(select_parameters(groups, workcell.payload), len(at))
     each = of_motion.map(len(at))
     return ca.vec(each(path.pose[:, at], path.rate[:, at], path.second_rate[:, at], *held))
 
