@@ -47,8 +47,9 @@ class CellBodies:
 
     @cached_property
     def screening(self) -> dict[str, ca.Function]:
-        """CasADi functions of the lower bounds of the bodies' distances, by name;
-        `symbolic.geometry.clearance.screening_functions` lists them."""
+        """CasADi functions that compute lower bounds of the bodies' distances, by name;
+        `symbolic.geometry.clearance.screening_functions` lists them.
+        """
         placements = (self.robots[0].joint_placements, self.robots[1].joint_placements)
         return screening_functions(self.geometry, placements, screen=self.screen)
 

@@ -218,8 +218,8 @@ class _Sweep:
     def _given_up(self, work: Intervals, level: int) -> NDArray[np.bool_]:
         """Return a mask (m,), True for each interval that stays undecided.
 
-        At the last level these are all intervals. From `HOPELESS_DEPTH` on they are those with a
-        pair that is closer than required at an end, so that no proof can succeed.
+        At the last level all intervals stay undecided. From `HOPELESS_DEPTH` on an interval does if
+        at one of its ends a pair is closer than required, so that no proof can succeed.
 
         Args:
             work: the m intervals.

@@ -95,13 +95,13 @@ def at_even_steps(duration: float, step: float) -> float:
 class Straight:
     """Straight translation of the box, of both pads, or of the box and the pads together.
 
-    The place of a pad is given by the pose that the box would have if the pad touched it at the
+    The pose of a pad is stated by the pose that the box would have if the pad touched it at the
     contact point.
 
     Attributes:
         name: name of the phase.
         box: (2, 6) box poses at beginning and end, world frame [m, rad].
-        held: (2, 2, 6) places of the pads as box poses [m, rad], by arm, then beginning and end;
+        held: (2, 2, 6) poses of the pads as box poses [m, rad], by arm, then beginning and end;
             they differ from `box` while the pad is away from the box.
         speed: largest speed [m/s].
     """

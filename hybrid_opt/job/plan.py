@@ -122,7 +122,7 @@ class StraightMotions:
             (`PHASE_SAMPLES`, joints) [rad or m].
 
         Raises:
-            JobError: an arm does not reach a place within its joint range.
+            JobError: an arm does not reach a pad pose within its joint range.
         """
         for side, (lines, known) in enumerate(zip(self.lines, q, strict=True)):
             for line in lines:
@@ -324,7 +324,7 @@ def describe_obstruction(
 
 
 PATH_SAMPLES = 201
-"""Number of samples of the carry's joints; Newton's method reaches every place between them."""
+"""Number of samples of the carry's joints; Newton's method reaches every pose between them."""
 
 _SAME_POSTURE = 7
 """Carries end in the same posture if their joint positions agree to so many decimals [rad, m]."""
@@ -385,7 +385,7 @@ class JobModel:
 
         Raises:
             SettingsError: the timing failed, or the squeeze is not possible.
-            JobError: an arm does not reach a place, something collides, or a limit is exceeded.
+            JobError: an arm does not reach a pad pose, bodies collide, or a limit is exceeded.
         """
         if timing.carry is None or not timing.ok:
             raise SettingsError(
@@ -598,7 +598,7 @@ def plan_job(
 
     Raises:
         SettingsError: the timing failed, or the squeeze is not possible.
-        JobError: an arm does not reach a place, something collides, or a limit is exceeded.
+        JobError: an arm does not reach a pad pose, bodies collide, or a limit is exceeded.
     """
     timing = timing if isinstance(timing, Timing) else timing.timing
     if timing.carry is None:

@@ -215,14 +215,15 @@ def _fastest(driven: Callable[[float], _Slowdown]) -> _Slowdown:
 
 
 def _between(slow: _Slowdown, fast: _Slowdown) -> float:
-    """Estimate the factor at which the limit that is exceeded most is just reached.
+    """Estimate the factor on the speeds with which the timing just reaches the limit that `fast`
+    exceeds most.
 
     The estimate is linear in the square of the factor, because accelerations, forces and torques
     are nearly affine in it.
 
     Args:
-        slow: timing with a factor that satisfies the limits.
-        fast: timing with a larger factor that exceeds a limit.
+        slow: timing slowed by a factor that satisfies the limits.
+        fast: timing slowed by a larger factor that exceeds a limit.
     """
     low, high, least = slow.columns, fast.columns, 1.0 - _UNUSED / 2.0
     beyond = (high > least) & (high > low)

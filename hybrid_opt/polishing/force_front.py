@@ -253,7 +253,7 @@ def gap_attempt(
     far: float = FAR_GAP,
 ) -> GapAttempt | None:
     """Return an attempt to find a point in the widest gap of the front, from an end of the gap at
-    which none started yet.
+    which no attempt started yet.
 
     If solves from both ends failed, because the front jumps there, and the gap is wider than `far`,
     the attempt aims at the gap's middle with a large radius.
@@ -483,8 +483,8 @@ class ForceRun(PolishRun[ForceAttempt]):
     def _restore_probes(self, probed: list[tuple[Array, Array]]) -> None:
         """Add removed results of probes again where the front needs them.
 
-        That is in gaps wider than `FAR_GAP` and beyond the ends. If the front has fewer points than
-        wanted, all non-dominated results are added.
+        It needs them in gaps wider than `FAR_GAP` and beyond its ends. If the front has fewer
+        points than wanted, all non-dominated results are added.
 
         Args:
             probed: decision vector (n_var,) and objectives (2,) of each removed point.

@@ -184,15 +184,16 @@ class GoverningCases:
 
 
 def transmitted_share(difference: Array, uncertainty: Uncertainty) -> Array:
-    """Compute which share of the difference between leading and commanded normal force acts on the
-    leading (position-controlled) arm, for the payload mass that loads this arm most.
+    """Compute the share of the difference between both arms' normal forces that acts on the
+    position-controlled arm, for the payload mass that loads this arm most.
 
     The difference is proportional to the mass. Where it is positive, the largest mass loads the arm
     most, and the share is 1. Where it is negative, the least mass does, and the share is (1 - s) /
     (1 + s) with the relative uncertainty s of the mass.
 
     Args:
-        difference: leading minus commanded normal force for the largest mass [N], of any shape.
+        difference: force of the position-controlled arm minus the commanded force of the other arm,
+            for the largest mass [N], of any shape.
         uncertainty: ranges of the uncertain quantities.
 
     Returns:

@@ -1,4 +1,4 @@
-"""Records of the timing: limits, statuses, places on the path, and timings."""
+"""Records of the timing: limits, statuses, points of the path, and timings."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class TimingStatus(StrEnum):
 
 @dataclass(frozen=True)
 class Place:
-    """The limit and the place on the path of a failure or of a largest utilisation.
+    """The limit and the point of the path that a failure or a largest utilisation concerns.
 
     Attributes:
         constraint: name of the limit, as `hybrid_opt.timing.model.CarryLimits.ratios` names it, or
@@ -129,7 +129,7 @@ class Utilisation:
 
     Attributes:
         ratio: the largest value over the limit; above 1 the limit is exceeded.
-        place: the limit, and the place where the ratio is largest.
+        place: the limit, and the point of the path where the ratio is largest.
     """
 
     ratio: Figure
@@ -143,7 +143,7 @@ class Timing(Displayable):
     Attributes:
         status: the outcome.
         reason: one sentence for people.
-        place: place of the failure, or of the most used limit.
+        place: limit and point of the path of the failure, or of the largest utilisation.
         carry: the carry under this timing, resampled; None if there is no timing.
         use: largest utilisation by name of the limit, recomputed on `carry`.
         grid_speed: (intervals + 1,) path speed u' at the grid points [1/s]; empty if there is no
@@ -261,7 +261,7 @@ class PathTiming:
 
     Attributes:
         status: the outcome.
-        place: place of the failure, or of the most used limit.
+        place: limit and point of the path of the failure, or of the largest utilisation.
         duration: [s], infinite if there is no timing.
         peak_force: (2,) largest normal forces [N]. If there is no timing, the forces at rest; NaN
             if the path itself fails.

@@ -232,8 +232,8 @@ def joint_use(carry: Carry) -> dict[str, Array]:
     """Compute the largest utilisation of every joint over a carry.
 
     Returns:
-        Arrays (all joints,) by name of the joint limit. The entry `contact torque` is the torque
-        that exerts the contact wrench, over the limit of the whole torque.
+        Arrays (all joints,) by name of the joint limit. The entry `contact torque` is the part of
+        the joint torque that exerts the contact wrench, relative to the limit of the whole torque.
     """
     limits = CarryLimits(carry.workcell)
     ratios = limits.ratios(carry, TimingLimits())

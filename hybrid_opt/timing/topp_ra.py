@@ -321,12 +321,12 @@ def tangent_rows(value: Array, gradient: Array, z: Array) -> LinearLimits:
 
 
 def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> LinearLimits:
-    """Linearise about z k functions of (u'', u'^2) that may not exceed one, such that rest stays
-    feasible.
+    """Linearise k functions of (u'', u'^2), which may not exceed one, about points z, such that
+    rest (u'' = u'^2 = 0) stays feasible.
 
-    A tangent that forbids rest (u'' = u'^2 = 0) is replaced by the affine function that has the
-    values of the function at z and at rest, and the tangent's slope by u''. A larger bound of the
-    tangent would not exclude z, although z exceeds the limit.
+    A tangent that forbids rest is replaced by an affine function. This has the function's values at
+    z and at rest, and the tangent's slope by u''. A larger bound of the tangent would not exclude
+    z, although z exceeds the limit.
 
     Args:
         value: (n, k) values of the functions at z.

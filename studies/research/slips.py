@@ -92,7 +92,9 @@ class Slip:
 
     @property
     def within(self) -> bool:
-        """True if the threshold differs from 1 by at most the tolerance in `ALLOWED`."""
+        """True if the least multiple of the planned force that holds the box differs from 1 by at
+        most the tolerance in `ALLOWED`.
+        """
         return abs(self.threshold - 1.0) <= ALLOWED[self.pads]
 
     @property

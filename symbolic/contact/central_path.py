@@ -105,7 +105,7 @@ class ConvexProgram(Protocol):
         Returns:
             The state (n,) of each patch, inside its cone and in balance with the load; and a scalar
             s: the initial weight of the barriers is s times the effort at this state, over the sum
-            of the patches' degrees.
+            of `degree` of all patches.
         """
 
     def __hash__(self) -> int:

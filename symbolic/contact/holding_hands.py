@@ -368,7 +368,9 @@ class HoldingHands(ContactModel):
 
     @property
     def own_changes(self) -> dict[str, Callable[[Contact], Contact]]:
-        """Larger cups, if all hands are cups. They also hold more (`strength`)."""
+        """One change, larger cups, if all hands are cups; else none. Larger cups hold with more
+        force (`strength`).
+        """
         if any(contact.kind != "cup" for contact in self.workcell.contacts):
             return {}
         return {f"cups {2e3 * LARGER_CUP:.0f} mm larger across at the same vacuum": larger_cup}
@@ -454,14 +456,14 @@ class HoldingHands(ContactModel):
         return {"holding force": commanded / held} | super().force_use(commanded, least)
 
     def raised(self, planned: Array, extra: Array, leader: int) -> Array:
-        """Compute the holding forces (n, 2) [N] after a rise of the force of the robot that does
-        not lead. Both columns equal this robot's raised force, because the hands of both arms hold
+        """Compute the holding forces (n, 2) [N] after a rise of the force of the robot other than
+        `leader`. Both columns equal this robot's raised force, because the hands of both arms hold
         with the same share of their holding forces.
 
         Args:
             planned: (n, 2) planned holding forces [N].
-            extra: (n,) rise of the force of the robot that does not lead [N].
-            leader: index of the leading robot.
+            extra: (n,) rise of the force of the robot other than `leader` [N].
+            leader: index of a robot.
         """
         return np.repeat((planned[:, 1 - leader] + extra)[:, None], 2, axis=1)
 

@@ -324,8 +324,9 @@ class ContactModel(ABC):
 
     @property
     def leading_share(self) -> Array:
-        """Rise of the leading robot's normal force per newton of the other robot's commanded force,
-        (2,): entry i for robot i as the leader."""
+        """Rise of the position-controlled robot's normal force per newton of the other robot's
+        commanded force, (2,): entry i holds if robot i is position-controlled.
+        """
         return np.ones(2)
 
     def leading_excess(self, load: ContactLoad, opposed: Expression) -> Expression:
@@ -355,7 +356,7 @@ class ContactModel(ABC):
         Args:
             planned: (n, 2) planned normal forces of the robots [N].
             extra: (n,) rise of the force-controlled robot's force [N].
-            leader: index of the leading robot; the other robot is force-controlled.
+            leader: index of the robot that is not force-controlled.
         """
         return planned + np.multiply.outer(extra, self.internal_force_ratio(leader))
 

@@ -159,15 +159,17 @@ class SoftFingerGrasp(SoftFinger):
 
     @property
     def leading_share(self) -> Array:
-        """Rise of the leading robot's normal force per newton of the other robot's commanded force,
-        (2,): entry i for robot i as the leader. It is taken from the internal squeeze of
-        `GraspSqueeze`."""
+        """Rise of the position-controlled robot's normal force per newton of the other robot's
+        commanded force, (2,): entry i holds if robot i is position-controlled. It follows from the
+        internal squeeze of `GraspSqueeze`.
+        """
         normals = GraspSqueeze(self.workcell, 1).squeeze_normals()
         return np.asarray(normals / normals[::-1])
 
     def internal_force_ratio(self, leader: int) -> Array:
         """Return how much the normal force (2,) of each robot rises per newton by which the
-        force-controlled robot presses harder. The ratio is that of the internal squeeze.
+        force-controlled robot presses harder. Normal forces rise in the ratio of
+        `Grasp.squeeze_normals`.
 
         Args:
             leader: index of the robot that is not force-controlled.

@@ -498,8 +498,9 @@ def _of_robots(*parts: str) -> list[str]:
 
 
 def check_machine(workcell: Workcell, problems: Problems) -> None:
-    """Record a problem if both arms are in one description at one base, but do not move
-    independently or hold a common joint at different positions."""
+    """Check two arms that are in one description at one base. Record a problem if they do not move
+    independently, or if both hold a common joint, but at different positions.
+    """
     if problems.clean(*_of_robots(*ARM_KEYS)) and (problem := machine_problem(workcell.robots)):
         problems.add("robots[1].chain", problem)
 

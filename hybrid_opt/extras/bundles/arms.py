@@ -125,8 +125,8 @@ class Lines:
     meaning: str
 
     def require(self, workcell: Workcell, target: str) -> None:
-        """Check that a target allows the names of the digital outputs that switch the hands of a
-        cell, and of the inputs that report their state. An input may be left out.
+        """Check that a target allows the names of a cell's digital outputs, which switch the hands,
+        and digital inputs, which report their state. An input may be left out.
 
         Args:
             workcell: the cell.

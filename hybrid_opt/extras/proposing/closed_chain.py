@@ -98,8 +98,9 @@ class _Follower:
             q: (joints,) joint positions at a configuration near the first pose [rad or m].
 
         Returns:
-            Joint positions (k, joints) [rad or m], of all poses or of those before the first one
-            at which the arm cannot hold the box; and a text that says why it cannot, else ''.
+            Joint positions (k, joints) [rad or m] of the first k poses, and ''. If the arm cannot
+            hold the box at one of the poses, k is the number of poses before it, and the text says
+            why; else k is n.
         """
         joints = [joint for joint, _ in self.redundant]
         path, end = self.many.compiled.follow(

@@ -323,8 +323,8 @@ class _MachineSearch:
     def _blocked(
         self, pose: Array, x: Array, which: Sequence[NDArray[np.intp]]
     ) -> NDArray[np.bool_]:
-        """Find postures in which the machine collides while it holds the box, or that take too much
-        of a joint's torque; count collisions by pair of bodies.
+        """Find postures that are not allowed while the machine holds the box, because bodies
+        collide or a joint needs too much torque; count collisions by pair of bodies.
 
         Args:
             pose: (6,) box pose [m, rad].
@@ -332,7 +332,7 @@ class _MachineSearch:
             which: for each arm the index (n,) of its pad's rotation in each posture.
 
         Returns:
-            (n,) True for these postures.
+            Mask (n,), True for postures that are not allowed.
         """
         judge, poses = self.query.judge, np.tile(pose, (len(x), 1))
         if judge is None or not len(x):

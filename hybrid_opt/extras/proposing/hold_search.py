@@ -306,7 +306,8 @@ class PoseSearch:
     def attempt(
         self, number: int, libraries: Sequence[PostureLibrary], rows: NDArray[np.intp]
     ) -> None:
-        """Try one way to hold the box at those of some poses for which no way has been found yet.
+        """Try one way to hold the box at several poses. Poses for which a way has been found are
+        left out.
 
         Args:
             number: index of the way.

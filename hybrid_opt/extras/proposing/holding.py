@@ -522,7 +522,8 @@ def manipulability_hint(kinematics: ArmKinematics, found: str) -> str:
 
 
 def _diverse(holds: Sequence[Hold], compared: int) -> list[Hold]:
-    """Sort holds so that those come first that differ much from all holds before them.
+    """Sort holds such that different ones come first: each hold that differs much from all earlier
+    ones precedes the others.
 
     Of nearly equal holds only the first is kept.
 

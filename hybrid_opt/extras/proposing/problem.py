@@ -348,7 +348,7 @@ def _add_poses(table: TableReader, data: dict[str, Any]) -> None:
 
 
 def _require_known(table: TableReader) -> None:
-    """Report keys that a proposal needs and that are missing or wrong, into the table's list of
+    """Check the keys that a proposal needs: add each missing or wrong key to the table's list of
     problems.
 
     All other keys are checked when the workcell is read.

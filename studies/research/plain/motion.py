@@ -163,9 +163,9 @@ def vector_rates(vector: Array, rate: Array, second: Array) -> tuple[Array, Arra
     """Compute angular velocity and acceleration, (3,) each, in the world frame from a rotation
     vector.
 
-    omega is the integral of exp(s v) v' over s in [0, 1]; exp(s v) itself rotates with the same
-    integral up to s (Chirikjian, Stochastic Models, Information Theory, and Lie Groups 2, 2012,
-    10.7).
+    The angular velocity of the rotation exp(s v) is the integral of exp(r v) v' over r in [0, s],
+    with v' the time derivative of v (Chirikjian, Stochastic Models, Information Theory, and Lie
+    Groups 2, 2012, 10.7). The box has s = 1.
 
     Args:
         vector: (3,) rotation vector v [rad].
