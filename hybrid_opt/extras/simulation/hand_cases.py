@@ -20,12 +20,7 @@ from hybrid_opt.extras.simulation.scene import SimulationSettings
 from hybrid_opt.robust.cases import LEADER, random_cases
 from hybrid_opt.robust.force import RobustModel, subsample
 from symbolic.array import Array
-from symbolic.contact.elastic import layer_shares
-from symbolic.contact.holding_hands import (
-    HandPatch,
-    internal_force_wrenches,
-    required_holding_forces,
-)
+from symbolic.contact.holding_hands import HoldingHands, internal_force_wrenches, yielded
 from symbolic.contact.worst_cases import case_origin_load_function
 from symbolic.records import Workcell
 
@@ -169,15 +164,15 @@ def _needed_share(workcell: Workcell, case: Array, load: Array, directions: Arra
         directions: (n, 3) unit vectors along which the arms work against each other, box frame.
     """
     pads, robots = workcell.pads, workcell.pad_robots
-    shares, pushes = layer_shares(pads), internal_force_wrenches(pads, robots)
+    hands = HoldingHands(workcell).sharing(ca.DM(case[:2]))
+    wrenches, pushes = yielded(ca.DM(load), hands), internal_force_wrenches(pads, robots)
     found = np.zeros(len(directions))
-    for pad, robot, share, push in zip(pads, robots, shares, pushes, strict=True):
+    for pad, robot, hand, own, push in zip(pads, robots, hands, wrenches, pushes, strict=True):
         # The second arm's hands push along the direction, the first arm's against it.
         opposed = float(case[17]) * (2 * robot - 1) * push @ directions.T
         wrench = ca.SX.sym("wrench", 6)
-        forces = required_holding_forces(wrench, float(case[robot]), HandPatch.of(pad))
-        needed = ca.Function("needed", [wrench], [ca.fmax(*forces)])
-        each = np.array(needed((share @ load)[:, None] + opposed)).ravel()
+        needed = ca.Function("needed", [wrench], [ca.fmax(*hand.needs(wrench))])
+        each = np.array(needed(np.array(own) + opposed)).ravel()
         found = np.maximum(found, each / pad.holding_force)
     return found
 

@@ -20,7 +20,14 @@ from hybrid_opt.robust.force import interpreted_robust_model
 from symbolic.array import Array
 from symbolic.contact.elastic import kern, layer_shares
 from symbolic.contact.force_closure import wrench_to_box
-from symbolic.contact.holding_hands import HandPatch, internal_force_needs, required_holding_forces
+from symbolic.contact.holding_hands import (
+    HandPatch,
+    HoldingHands,
+    SharingHand,
+    internal_force_needs,
+    required_holding_forces,
+    yielded,
+)
 from symbolic.contact.load import load_function
 from symbolic.contact.registry import contact_model, require_squeeze
 from symbolic.errors import SettingsError, WorkcellError
@@ -257,6 +264,103 @@ def test_a_cups_lip_has_the_moments_of_a_ring() -> None:
     assert kern(DISC) == (RADIUS / 4.0,) * 2
 
 
+# --- hands that yield ---
+
+
+def sharing(hands: Sequence[Contact]) -> list[SharingHand]:
+    shares = layer_shares(hands)
+    return [
+        SharingHand(ca.DM(share), ca.DM(wrench_to_box(hand)), hand.friction, HandPatch.of(hand))
+        for hand, share in zip(hands, shares, strict=True)
+    ]
+
+
+def borne(hands: Sequence[SharingHand], load: Array) -> Array:
+    """(n, 6) wrenches of hands after they have yielded."""
+    return np.array([np.array(own).ravel() for own in yielded(ca.DM(load), hands)])
+
+
+@given(seed=SEEDS, count=st.integers(1, 6), factor=st.floats(0.1, 10.0))
+def test_hands_that_yield_balance_the_load(seed: int, count: int, factor: float) -> None:
+    hands, load = random_hands(seed, count), random_load(seed)
+    wrenches = borne(sharing(hands), load)
+    total = sum(wrench_to_box(hand) @ own for hand, own in zip(hands, wrenches, strict=True))
+    np.testing.assert_allclose(total, load, atol=1e-9 * np.abs(load).max())
+    scaled = borne(sharing(hands), factor * load)
+    np.testing.assert_allclose(scaled, factor * wrenches, atol=1e-6 * np.abs(scaled).max())
+
+
+@given(seed=SEEDS, count=st.integers(1, 6))
+def test_hands_do_not_yield_while_a_rim_lifts_first(seed: int, count: int) -> None:
+    hands, load = random_hands(seed, count), random_load(seed)
+    hands = tuple(replace(hand, friction=20.0) for hand in hands)
+    shares = layer_shares(hands) @ load
+    lifting, sliding = np.max([needed(*each) for each in zip(hands, shares, strict=True)], axis=0)
+    if lifting >= sliding:
+        np.testing.assert_allclose(borne(sharing(hands), load), shares, atol=1e-9)
+
+
+def least_of_any_share(hands: Sequence[Contact], load: Array) -> float:
+    """Least holding force of round hands under which any balance of a load exists: a conic program
+    over the wrenches of all hands."""
+    n = len(hands)
+    cost, balance = np.zeros(1 + 6 * n), np.zeros((6, 1 + 6 * n))
+    cost[0] = 1.0
+    blocks = [(balance, load, [clarabel.ZeroConeT(6)])]
+    for k, hand in enumerate(hands):
+        own = slice(1 + 6 * k, 7 + 6 * k)
+        balance[:, own] = wrench_to_box(hand)
+        patch = HandPatch.of(hand)
+        lift, slide = np.zeros((3, 1 + 6 * n)), np.zeros((4, 1 + 6 * n))
+        lift[0, [0, 3 + 6 * k]] = slide[0, [0, 3 + 6 * k]] = -1.0
+        for row, entry in enumerate((3, 4), 1):
+            lift[row, 1 + 6 * k + entry] = -1.0 / patch.kern[0]
+        # Without the product of force and torsion: a lower bound.
+        lengths = (1.0, 1.0, float(patch.twist))
+        for row, (entry, length) in enumerate(zip((0, 1, 5), lengths, strict=True), 1):
+            slide[row, 1 + 6 * k + entry] = -1.0 / (hand.friction * length)
+        blocks += [(lift, np.zeros(3), [clarabel.SecondOrderConeT(3)])]
+        blocks += [(slide, np.zeros(4), [clarabel.SecondOrderConeT(4)])]
+    found = solved(np.zeros((1 + 6 * n,) * 2), cost, blocks)
+    assert found is not None
+    return float(found[0])
+
+
+@given(seed=SEEDS, count=st.integers(2, 5))
+def test_no_share_holds_with_less_than_the_best_one(seed: int, count: int) -> None:
+    """All normals are parallel: facing hands could squeeze, and the program would have no end."""
+    load, down = random_load(seed), np.diag([1.0, -1.0, -1.0])
+    hands = [
+        replace(hand, T_box_pad=transform(down, hand.T_box_pad[:3, 3]))
+        for hand in random_hands(seed, 3 * count)
+        if hand.half_sides is None
+    ]
+    wrenches = borne(sharing(hands), load)
+    found = max(needed(*each).max() for each in zip(hands, wrenches, strict=True))
+    least = least_of_any_share(hands, load)
+    assert found >= least - 1e-5 * max(1.0, abs(least))
+
+
+@pytest.mark.parametrize("pushed", [0.3, 0.6, 0.9])
+def test_a_pressed_hand_takes_over_what_a_pulled_one_cannot_bear(pushed: float) -> None:
+    """Two cups in a line along the load, of which a moment presses one and pulls the other: they
+    slide together once the friction of both is used up."""
+    ahead, behind = (
+        replace(CUP, T_box_pad=transform(np.diag([1.0, -1.0, -1.0]), np.array([x, 0.0, 0.0])))
+        for x in (0.1, -0.1)
+    )
+    along, hands = 60.0, (ahead, behind)
+    load = np.array([along, 0.0, 0.0, 0.0, 0.0, 0.0])
+    load[4] = pushed * along / FRICTION * 0.1
+    together = along / FRICTION / 2.0
+    own = layer_shares(hands) @ load
+    alone = max(needed(*each)[1] for each in zip(hands, own, strict=True))
+    wrenches = borne(sharing(hands), load)
+    found = max(needed(*each).max() for each in zip(hands, wrenches, strict=True))
+    assert alone > 1.1 * together
+    assert together * (1.0 - 1e-9) <= found < together + 0.5 * (alone - together)
+
+
 # --- a cell ---
 
 
@@ -287,10 +391,11 @@ def test_an_arm_needs_what_its_most_loaded_hand_needs(seed: int, name: str) -> N
     np.testing.assert_allclose(wrench[:3], total, atol=1e-9)
     about = rotation.T @ found["required_moment"] + np.cross(cell.payload.centre_of_mass, total)
     np.testing.assert_allclose(wrench[3:], about, atol=1e-9)
-    shares = layer_shares(cell.pads)
+    model = HoldingHands(cell)
+    hands = model.sharing(ca.DM([contact.friction for contact in cell.contacts]))
     expected = np.zeros(2)
-    for pad, i, share in zip(cell.pads, cell.pad_robots, shares, strict=True):
-        expected[i] = max(expected[i], *needed(pad, share @ wrench))
+    for pad, i, own in zip(cell.pads, cell.pad_robots, borne(hands, wrench), strict=True):
+        expected[i] = max(expected[i], *needed(pad, own))
     np.testing.assert_allclose(found["normal_force"], expected, rtol=1e-9, atol=1e-9)
     most = cell.contacts[0].friction * found["normal_force"]
     assert (found["tangential_force"] <= most + 1e-9).all()
