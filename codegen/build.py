@@ -540,7 +540,7 @@ def _begin(
     begun before the library that links them.
     """
     flags = () if source.lanes == 1 else LANE_FLAGS
-    rest, parts = in_parts(source.text, source.lanes, source.most)
+    rest, parts = in_parts(source.text, source.most)
     # Names and shapes are part of the C text, except which of two equal layouts they mean.
     signature = None if source.signature is None else source.signature.to_json()
     key = key_of(

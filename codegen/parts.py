@@ -86,12 +86,11 @@ class CodePart:
     level: int
 
 
-def in_parts(text: str, lanes: int, most: int = 3) -> tuple[str, tuple[CodePart, ...]]:
+def in_parts(text: str, most: int = 3) -> tuple[str, tuple[CodePart, ...]]:
     """Replace long functions of a C text by declarations, so that they are compiled separately.
 
     Args:
         text: C text from `codegen.source`.
-        lanes: number of lanes of the text; 0 for the machine's width.
         most: highest optimisation level of a separate function.
 
     Returns:
@@ -100,7 +99,7 @@ def in_parts(text: str, lanes: int, most: int = 3) -> tuple[str, tuple[CodePart,
     before = {
         "casadi": _preamble(*(["one_lane.h"] if "dual_arm_sin" in text else []), "part.h"),
         "lanes": _preamble("one_lane.h")
-        + (f"#define DUAL_ARM_LANES {lanes}\n" if lanes else "")
+        + _width(text)
         + runtime("lanes.h")
         + "#if DUAL_ARM_LANES > 1\n",
     }
@@ -135,6 +134,14 @@ def in_parts(text: str, lanes: int, most: int = 3) -> tuple[str, tuple[CodePart,
     )
     text = re.sub(r"\b(?:PART_)?(\w+_f\d+)\b", lambda found: names.get(found[1], found[0]), text)
     return text, tuple(parts.values())
+
+
+def _width(text: str) -> str:
+    """Return the line of a C text that states the number of its lanes, directly before `lanes.h`;
+    empty if the text takes the machine's width or has no lanes."""
+    before = text.partition(runtime("lanes.h"))[0]
+    stated = re.search(r"^#define DUAL_ARM_LANES \d+\n\Z", before, re.M)
+    return stated[0] if stated else ""
 
 
 @cache

@@ -48,6 +48,11 @@ expected."""
 RESOLUTION = 0.008
 """Difference of the factors on both sides of a threshold."""
 
+BELLOWS = 0.1
+"""Stiffness along the normal of cups that face each other, over that of a usual layer. Between
+stiffer ones a payload that slides and turns by a millimetre jams, and holds with less force than
+statics says."""
+
 ROUGH = 1e6
 """Coefficient of friction with which nothing slides."""
 
@@ -240,6 +245,7 @@ def _draw_cell(kind: str, rng: np.random.Generator) -> Workcell:
         sort: HandKind = "cup"
         if kind in ("magnets", "fingers"):
             sort = "magnet" if kind == "magnets" else "fingers"
+        bellows = BELLOWS if kind == "cups beside" else 1.0
         hands = [
             Contact(
                 transform(_axes(np.array(normal)), np.array(place)),
@@ -248,6 +254,8 @@ def _draw_cell(kind: str, rng: np.random.Generator) -> Workcell:
                 half_sides=(float(half[0]), float(half[1])) if is_plate else None,
                 kind=sort,
                 holding_force=1.0,
+                layer_shear=Contact.layer_shear / bellows,
+                layer_stiffness=bellows,
             )
             for place, normal in places
         ]

@@ -343,7 +343,7 @@ def test_parts_and_pieces_give_the_bits_of_the_whole(
         monkeypatch.setattr(parts, "CUT_STATEMENTS", CUT)
         monkeypatch.setattr(parts, "LEAST_ENTRY", 0)
     else:
-        _, apart = in_parts(c_source(dense(function), lanes), lanes)
+        _, apart = in_parts(c_source(dense(function), lanes))
         assert len(apart) == (1 if lanes == 1 else 2)
     parted = compile_function(function, cache, level=1, lanes=lanes).batch(x)
     assert cut or len(list(cache.folder.glob("*.o"))) == len(apart)
@@ -385,7 +385,7 @@ def test_what_calls_others_or_is_short_stays_as_it_is(monkeypatch: pytest.Monkey
     for least, function in ((0, matrices), (10**9, leaf("inner"))):
         monkeypatch.setattr(parts, "LEAST_BYTES", least)
         text = c_source(function)
-        assert in_parts(text, 1) == (text, ())
+        assert in_parts(text) == (text, ())
         assert in_pieces(text) == text
 
 
@@ -428,11 +428,13 @@ void twice_norm_release(int mem) { (void)mem; }
 """
 
 
+POINT = ca.SX.sym("x", 3)
+NORM = ca.Function("norm", [POINT], [ca.norm_2(POINT)])
+
+
 def source(text: str = TEXT) -> tuple[Signature, str]:
-    x = ca.SX.sym("x", 3)
-    norm = ca.Function("norm", [x], [ca.norm_2(x)])
     signature = Signature("twice_norm", ("x",), ("y",), ((3,),), ((),))
-    return signature, handwritten_source(signature, text, [norm])
+    return signature, handwritten_source(signature, text, [NORM])
 
 
 def refuse() -> tuple[Signature, str]:
@@ -449,6 +451,23 @@ def test_a_batch_calls_its_helper_and_is_found_again(tmp_path: Path) -> None:
     np.testing.assert_array_equal(again(x[0])["y"], function(x[0])["y"])
     with pytest.raises(CodegenError, match="twice_norm"):
         load_or_compile("other", lambda: source("no C at all"), cache)
+
+
+def test_long_helpers_in_pairs_are_compiled_for_two_lanes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(parts, "LEAST_ENTRY", 0)
+    monkeypatch.setattr(parts, "LEAST_BYTES", 0)
+    signature, _ = source()
+    helper = leaf("inner")
+    pair = (
+        "typedef int called(const lanes_real**, lanes_real**, lanes_int*, lanes_real*);\n"
+        "called* volatile kept = in_pairs;\n"
+    )
+    text = handwritten_source(signature, pair + TEXT, [NORM], {"in_pairs": helper})
+    assert {part.text.count("DUAL_ARM_LANES 2\n#") for part in in_parts(text)[1]} >= {0}
+    function = load_or_compile("pairs", lambda: (signature, text), Cache(tmp_path))
+    assert function(np.ones(3))["y"] == pytest.approx(2.0 * np.sqrt(3.0))
 
 
 @pytest.mark.parametrize("to_all", [True, False])
