@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import cached_property, lru_cache, wraps
+from functools import cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 Loaded = TypeVar("Loaded")
 
 CACHED_WORKCELLS = 2
-"""Number of workcells for which `cache_by_workcell` keeps results."""
+"""Number of workcells for which functions of a workcell, such as `robust_model`, keep results."""
 
 
 class CompiledCell:
@@ -359,42 +359,11 @@ def _expressions(folder: Path) -> str:
     return Cache(folder).code_digest("symbolic")
 
 
-class _Identity:
-    """Key of a cache for one workcell object; two keys are equal if they hold the same object."""
-
-    def __init__(self, workcell: Workcell) -> None:
-        self.workcell = workcell
-
-    def __hash__(self) -> int:
-        return id(self.workcell)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Identity) and self.workcell is other.workcell
-
-
-def cache_by_workcell(build: Callable[[Workcell], Loaded]) -> Callable[[Workcell], Loaded]:
-    """Return a function that calls `build` once per workcell and caches the results of the last few
-    workcells. Workcells are compared by identity, not by value.
-    """
-
-    @lru_cache(maxsize=CACHED_WORKCELLS)
-    def kept(identity: _Identity) -> Loaded:
-        return build(identity.workcell)
-
-    @wraps(build, updated=())
-    def built(workcell: Workcell) -> Loaded:
-        return kept(_Identity(workcell))
-
-    return built
-
-
-def _numbers(workcell: Workcell) -> WorkcellParameters:
+@lru_cache(maxsize=CACHED_WORKCELLS)
+def _parameters(workcell: Workcell) -> WorkcellParameters:
     from symbolic.parameters import WorkcellParameters
 
     return WorkcellParameters(workcell)
-
-
-_held_numbers = cache_by_workcell(_numbers)
 
 
 def bound_to(function: NumericFunction, numbers: WorkcellParameters) -> NumericFunction:
@@ -435,7 +404,7 @@ def contact_function(
     Raises:
         DualArmError: the code of the function cannot be built.
     """
-    numbers = _held_numbers(workcell)
+    numbers = _parameters(workcell)
     of = (name, numbers.workcell_digest, lanes)
     if of not in _held:
         cache = Cache()

@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import casadi as ca
 import numpy as np
 
-from hybrid_opt.compiled_cell import cache_by_workcell
+from hybrid_opt.compiled_cell import CACHED_WORKCELLS
 from symbolic.array import Array, Pair
 from symbolic.contact.load import LOAD_OUTPUTS, uncertain_load_function
 from symbolic.contact.registry import contact_model
@@ -53,7 +54,7 @@ class StaticHold:
     payload_limit: float
 
 
-@cache_by_workcell
+@lru_cache(maxsize=CACHED_WORKCELLS)
 def static_hold(workcell: Workcell) -> StaticHold:
     """Compute the contact forces that hold the payload level and at rest; cached per workcell.
 
@@ -96,7 +97,7 @@ def payload_limit(workcell: Workcell, contact_force: Array) -> float:
     return float(mass_at_reference(workcell, contact_force).min())
 
 
-_load_of = cache_by_workcell(uncertain_load_function)
+_load_of = lru_cache(maxsize=CACHED_WORKCELLS)(uncertain_load_function)
 
 
 def still_load(

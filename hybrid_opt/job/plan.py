@@ -29,7 +29,7 @@ from hybrid_opt.collision.checker import (
     BodyDistances,
     CollisionChecker,
 )
-from hybrid_opt.compiled_cell import CACHED_WORKCELLS, CompiledCell, cache_by_workcell
+from hybrid_opt.compiled_cell import CACHED_WORKCELLS, CompiledCell
 from hybrid_opt.errors import JobError
 from hybrid_opt.job.motions import (
     PHASE_SAMPLES,
@@ -573,7 +573,7 @@ def command_forces(
     return CommandedForces(normal, job.squeeze, job)
 
 
-_model = cache_by_workcell(JobModel)
+_model = lru_cache(maxsize=CACHED_WORKCELLS)(JobModel)
 
 
 class HasTiming(Protocol):

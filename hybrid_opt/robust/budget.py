@@ -302,10 +302,10 @@ def _excess(
     scale = required / known if np.isfinite(required).all() else np.ones(2)
 
     def excess(changed: Workcell) -> float:
-        try:
-            force = largest_forces(model.with_workcell(changed), motion, rows)
-        except SettingsError:
+        other = model.with_workcell(changed)
+        if not other.has_worst_cases(changed.uncertainty):
             return UNBOUNDED
+        force = largest_forces(other, motion, rows)
         return min(float((scale * force / allowed).max()) - 1.0, UNBOUNDED)
 
     return excess

@@ -12,7 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
-from functools import cache, cached_property, partial
+from functools import cache, cached_property, lru_cache, partial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,7 +28,7 @@ from hybrid_opt.carry import (
     motion_inputs,
     tile_motion,
 )
-from hybrid_opt.compiled_cell import cache_by_workcell, contact_function
+from hybrid_opt.compiled_cell import CACHED_WORKCELLS, contact_function
 from hybrid_opt.robust.cases import governing_cases, nominal_case, random_cases, worst_cases
 from symbolic.array import Array, Count, evenly
 from symbolic.contact.model import ContactModel
@@ -157,7 +157,7 @@ class RobustModel:
             raise SettingsError(": ".join(problem))
         self._load, self._one = load, command_model(workcell).has_scalar_squeeze
         self._squeeze, self._slack = cache(self._squeeze_function), cache(self._slack_function)
-        self._describe(workcell)
+        self._describe(command_model(workcell))
         if self._one:
             self._squeeze(1, True)
             self._squeeze(1, False)
@@ -170,15 +170,15 @@ class RobustModel:
             workcell: workcell that differs only in friction, mass and uncertainty.
         """
         other = copy(self)
-        other._describe(workcell)
+        other._describe(self._contact.with_workcell(workcell))
         return other
 
-    def _describe(self, workcell: Workcell) -> None:
-        """Store the workcell, its contact model and its nominal case, and forget the cached worst
+    def _describe(self, contact: ContactModel) -> None:
+        """Store a contact model, its workcell and its nominal case, and forget the cached worst
         cases.
         """
-        self.workcell, self._contact = workcell, command_model(workcell)
-        self._nominal = nominal_case(workcell)[None]
+        self.workcell, self._contact = contact.workcell, contact
+        self._nominal = nominal_case(contact.workcell)[None]
         self._worst: dict[tuple[int, int], tuple[Uncertainty, Array]] = {}
 
     def _squeeze_function(self, commanded: int, displaced: bool) -> NumericFunction:
@@ -191,6 +191,11 @@ class RobustModel:
     def _slack_function(self, commanded: int) -> NumericFunction:
         make = partial(case_slack_function, commanded=commanded)
         return self._load(self.workcell, f"case_slack_function {commanded}", make, lanes=0)
+
+    def has_worst_cases(self, uncertainty: Uncertainty) -> bool:
+        """Return True if an uncertainty leaves friction, contact patches, mass and transmitted
+        force, so that `worst_cases` exist."""
+        return _has_positive_remainders(self._contact, uncertainty)
 
     def worst_cases(self, uncertainty: Uncertainty, leader: int) -> Array:
         """Return the worst cases (k, 18) of an uncertainty, read-only. A force that holds the box
@@ -205,7 +210,7 @@ class RobustModel:
         """
         key = id(uncertainty), leader
         if key not in self._worst:
-            if not _has_positive_remainders(self._contact, uncertainty):
+            if not self.has_worst_cases(uncertainty):
                 raise SettingsError(
                     "the uncertainty leaves no friction or no patch; make its shares, tilt or "
                     f"displacements smaller ({uncertainty})",
@@ -566,7 +571,7 @@ def _has_positive_remainders(contact: ContactModel, uncertainty: Uncertainty) ->
     return bool(min(left) > 0.0)
 
 
-robust_model = cache_by_workcell(RobustModel)
+robust_model = lru_cache(maxsize=CACHED_WORKCELLS)(RobustModel)
 """Return the robust model of a workcell. Repeated calls with the same record return the same
 model."""
 

@@ -9,14 +9,14 @@ the largest squeeze, called governing.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from codegen.interpreted import interpret
 from hybrid_opt.carry import BoxMotion, Carry, box_motion, motion_inputs, tile_motion
-from hybrid_opt.compiled_cell import bound_to, cache_by_workcell, contact_function
+from hybrid_opt.compiled_cell import CACHED_WORKCELLS, bound_to, contact_function
 from hybrid_opt.robust.cases import (
     FOLLOWER,
     LEADER,
@@ -215,7 +215,7 @@ class RobustPath:
         return governing.slopes(slopes[: len(points)], slopes[len(points) :])
 
 
-robust_path = cache_by_workcell(RobustPath)
+robust_path = lru_cache(maxsize=CACHED_WORKCELLS)(RobustPath)
 """Return the `RobustPath` of a workcell. Repeated calls with the same record return the same
 object."""
 

@@ -128,7 +128,7 @@ def applicable_jerk_limits(workcell: Workcell, limits: TimingLimits) -> JerkLimi
         The workcell's jerk limits; None if it states none, or if `limits` bound robust forces and
         the contact model has no derivatives of these.
     """
-    slopes = command_model(workcell).has_scalar_squeeze or not limits.robust
+    slopes = not limits.robust or command_model(workcell).has_scalar_squeeze
     return JerkLimits.from_workcell(workcell) if slopes else None
 
 

@@ -159,6 +159,10 @@ class ContactModel(ABC):
     def __init__(self, workcell: Workcell) -> None:
         self.workcell = workcell
 
+    def with_workcell(self, workcell: Workcell) -> ContactModel:
+        """Return the same contact model of another workcell with the same arrangement of pads."""
+        return type(self)(workcell)
+
     @property
     def has_scalar_squeeze(self) -> bool:
         """True if the normal force of one pad determines the normal force of the other. One number,

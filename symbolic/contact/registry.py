@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 
 from symbolic.contact.holding_hands import HoldingHands
 from symbolic.contact.model import ContactModel
@@ -19,6 +20,11 @@ CONTACT_MODELS: dict[str, Callable[[Workcell], ContactModel]] = {
 """Contact models by the name in `task.allocation` of a workcell file."""
 
 
+CACHED_MODELS = 16
+"""Number of workcells whose contact models are cached."""
+
+
+@lru_cache(maxsize=CACHED_MODELS)
 def contact_model(workcell: Workcell) -> ContactModel:
     """Return the contact model that `task.allocation` of a workcell names."""
     return CONTACT_MODELS[workcell.task.allocation](workcell)
@@ -54,6 +60,7 @@ def require_squeeze(workcell: Workcell, purpose: str) -> None:
         raise SettingsError(problem, code="needs-pads")
 
 
+@lru_cache(maxsize=CACHED_MODELS)
 def command_model(workcell: Workcell) -> ContactModel:
     """Return the contact model with which a workcell's commanded forces and worst cases are
     computed."""

@@ -473,9 +473,10 @@ class CollisionSettings:
     most_pieces: Annotated[int, Range(1, 20_000)] = 500
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Workcell:
-    """A dual-arm cell and its task.
+    """A dual-arm cell and its task. Two records are equal only if they are the same object, so that
+    results can be cached by workcell.
 
     Attributes:
         name: title for reports.

@@ -160,7 +160,7 @@ class GraspNumbers:
     given: ParameterGroup | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class NumberedWorkcell(Workcell):
     """A cell with symbols as parameters and a known arrangement of its pads.
 

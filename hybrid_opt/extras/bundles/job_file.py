@@ -18,14 +18,14 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any, Literal
 
 import numpy as np
 import pinocchio as pin
 from scipy.interpolate import BPoly
 
-from hybrid_opt.compiled_cell import cache_by_workcell
+from hybrid_opt.compiled_cell import CACHED_WORKCELLS
 from hybrid_opt.errors import JobError
 from hybrid_opt.extras.bundles.arms import prefixes
 from hybrid_opt.extras.bundles.programs.carry_job import FORMAT, VERSION, Limits
@@ -216,7 +216,7 @@ def pad_jacobians(workcell: Workcell, arm: int, q: Array) -> Array:
     return found
 
 
-timing_model = cache_by_workcell(TimingModel)
+timing_model = lru_cache(maxsize=CACHED_WORKCELLS)(TimingModel)
 
 START, PATH = 0.005, 0.02
 """Largest distance of a pad from its first position, and from its path [m]."""

@@ -9,6 +9,7 @@ needless ones, and every line is proven free of collisions.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -16,13 +17,14 @@ import numpy as np
 from hybrid_opt.carry import joints_of
 from hybrid_opt.collision.certify import certify
 from hybrid_opt.collision.checker import CollisionChecker
-from hybrid_opt.compiled_cell import CompiledCell, cache_by_workcell
+from hybrid_opt.compiled_cell import CACHED_WORKCELLS, CompiledCell
 from hybrid_opt.errors import JobError
 from hybrid_opt.extras.proposing.planner import connected
 from hybrid_opt.job.plan import JobCollisions, SupportedPose
 from hybrid_opt.job.records import Job
 from symbolic.array import Array
 from symbolic.errors import SettingsError
+from symbolic.records import Workcell
 
 JOINT_STEP = 0.04
 """Largest change of a joint between configurations that are checked on a line [rad or m]."""
@@ -41,7 +43,10 @@ PROOF_POINTS = 17
 
 _CLOSER = "choose joint positions nearer to the job's"
 
-_collisions = cache_by_workcell(lambda cell: JobCollisions(CompiledCell.of(cell), everywhere=True))
+
+@lru_cache(maxsize=CACHED_WORKCELLS)
+def _collisions(workcell: Workcell) -> JobCollisions:
+    return JobCollisions(CompiledCell.of(workcell), everywhere=True)
 
 
 def plan_reach(job: Job, q: Array, *, rng: np.random.Generator, after: bool = False) -> Array:
