@@ -10,12 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import lru_cache, partial
 
 import numpy as np
 
 from hybrid_opt.carry import BoxMotion, Carry
 from hybrid_opt.cell import Cell
+from hybrid_opt.compiled_cell import CACHED_WORKCELLS
 from hybrid_opt.recommending.choice import DrivenPaths, Option
 from hybrid_opt.robust.cases import LEADER, nominal_case
 from hybrid_opt.robust.force import HOLDS, RobustModel, robust_model, subsample
@@ -183,16 +184,39 @@ def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str
     """Yield small changes of the cell as text, each with the resulting change of the largest
     commanded force along a motion [N], negative if the force falls.
 
-    Stronger hands may need a larger force, so the force of the changed cell is divided by the ratio
-    of the holding forces (`ContactModel.strength`) of changed to present hands.
-
     Args:
         workcell: the cell.
         motion: motion of the box.
     """
     doubt = workcell.uncertainty
     now = robust_model(workcell).commanded(motion, doubt, LEADER)
-    at = motion.at(np.argsort(-now)[:LOOKED_AT])
+    most = motion.at(np.argsort(-now)[:LOOKED_AT])
+    for changed in changed_cells(workcell):
+        needed = changed.model.commanded(motion if changed.is_large else most, doubt, LEADER)
+        yield changed.change, float(needed.max() / changed.strength - now.max())
+
+
+@dataclass(frozen=True)
+class ChangedCell:
+    """A cell with one small change of its pads.
+
+    Attributes:
+        change: changed quantity and the size of its change, as text.
+        model: computes robust forces of the changed cell.
+        strength: ratio of the holding forces (`ContactModel.strength`) of changed to present hands,
+            by which forces are divided, because stronger hands may need a larger force.
+        is_large: True if the change may move the largest force to other samples of a motion.
+    """
+
+    change: str
+    model: RobustModel
+    strength: float = 1.0
+    is_large: bool = False
+
+
+@lru_cache(maxsize=CACHED_WORKCELLS)
+def changed_cells(workcell: Workcell) -> tuple[ChangedCell, ...]:
+    """Return a cell with each small change that the advice considers; cached per workcell."""
     up, height = _height(workcell)
     changes: dict[str, Callable[[Contact], Contact]] = {
         f"friction {FRICTION_CHANGE:g} higher": _with_friction,
@@ -204,19 +228,18 @@ def changes_of_cell(workcell: Workcell, motion: BoxMotion) -> Iterator[tuple[str
     changes |= contact_model(workcell).own_changes
     if is_held_at_sides:
         changes["pads 1 mm lower"] = partial(_moved, by=-MILLIMETRE * up)
+    found = []
     for name, change in changes.items():
         other = _with_pads(workcell, change)
-        needed = RobustModel(other).commanded(at, doubt, LEADER)
         stronger = contact_model(other).strength / contact_model(workcell).strength
-        yield name, float(needed.max() / stronger - now.max())
+        found.append(ChangedCell(name, RobustModel(other), stronger))
     if is_held_at_sides and abs(height) > LEAST_HEIGHT:
         level = _with_pads(workcell, partial(_moved, by=-height * up))
-        needed = RobustModel(level).commanded(motion, doubt, LEADER)
         side = "above" if height > 0.0 else "below"
-        yield (
-            f"pads at the height of the centre of mass, now {1e3 * abs(height):.0f} mm {side} it",
-            float(needed.max() - now.max()),
-        )
+        now = f"now {1e3 * abs(height):.0f} mm {side} it"
+        name = f"pads at the height of the centre of mass, {now}"
+        found.append(ChangedCell(name, RobustModel(level), is_large=True))
+    return tuple(found)
 
 
 def _height(workcell: Workcell) -> tuple[Array, float]:
