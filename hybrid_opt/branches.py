@@ -21,8 +21,8 @@ import numpy as np
 
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations, concatenated
-from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
-from hybrid_opt.indicators.metrics import REFERENCE_POINT, front_rows, hypervolume
+from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES, front_rows
+from hybrid_opt.indicators.metrics import REFERENCE_POINT, hypervolume
 from hybrid_opt.metaheuristics.run import SearchSettings, search_carries
 from hybrid_opt.progress import ShowProgress, progress_bar
 from symbolic.array import Array

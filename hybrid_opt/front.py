@@ -20,6 +20,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.display_protocol import Displayable
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
+from hybrid_opt.evaluate.objectives import front_rows
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.records import PolishedFront
 from symbolic.array import Array, set_read_only
@@ -66,7 +67,7 @@ class Front(Displayable):
             evaluations: all candidates, already processed by `CandidateEvaluator.certified`.
             replica: number of the replica in its study, None outside of studies.
         """
-        rows = metrics.front_rows(evaluations.objectives, evaluations.feasible)
+        rows = front_rows(evaluations.objectives, evaluations.feasible)
         x, objectives = evaluations.x[rows], evaluations.objectives[rows]
         return cls(cell, algorithm, x, objectives, evaluations, replica=replica)
 

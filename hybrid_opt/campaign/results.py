@@ -34,8 +34,8 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import counted, figures_html, lines
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.evaluate.evaluation import Evaluations, concatenated
+from hybrid_opt.evaluate.objectives import front_rows
 from hybrid_opt.front import Front
-from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.store.bundle_file import MANIFEST, read_manifest
 from hybrid_opt.store.files import (
@@ -82,7 +82,7 @@ class Replica:
         """(k,) indices into `evaluations` of the non-dominated feasible candidates, by increasing
         first objective.
         """
-        return metrics.front_rows(self.evaluations.objectives, self.evaluations.feasible)
+        return front_rows(self.evaluations.objectives, self.evaluations.feasible)
 
     @property
     def front(self) -> Array:
@@ -232,7 +232,7 @@ def union(fronts: Sequence[Front]) -> list[tuple[Front, int]]:
     """
     members = [(front, row) for front in fronts for row in range(len(front))]
     objectives = np.concatenate([front.objectives for front in fronts])
-    return [members[k] for k in metrics.front_rows(objectives, np.ones(len(members), dtype=bool))]
+    return [members[k] for k in front_rows(objectives, np.ones(len(members), dtype=bool))]
 
 
 def read_campaign(root: str | Path) -> CampaignResults:

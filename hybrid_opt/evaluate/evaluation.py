@@ -38,9 +38,9 @@ from hybrid_opt.evaluate.objectives import (
     PAPER_OBJECTIVES,
     Objective,
     force_kind,
+    non_dominated,
     select_objectives,
 )
-from hybrid_opt.indicators.metrics import non_dominated
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.functions import CONSTRAINTS, SAMPLE_NAMES

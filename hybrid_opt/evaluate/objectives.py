@@ -1,4 +1,5 @@
-"""Objectives of a search, each a pure function of the evaluator's outputs.
+"""Objectives of a search, each a pure function of the evaluator's outputs; and which points of a
+set are non-dominated in them, its front.
 
 The paper's two objectives are the peak normal forces of both robots (Eq. 60). All objectives are
 dimensionless, and scaled such that values of interest are below one. The paper's penalty gives
@@ -11,6 +12,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -327,3 +329,55 @@ def select_objectives(wanted: Sequence[str | Objective]) -> tuple[Objective, ...
             f"objectives {', '.join(names)}: name at least one, each once", code="repeated"
         )
     return found
+
+
+# --- fronts ---
+
+
+def non_dominated(objectives: ArrayLike, feasible: ArrayLike | None = None) -> NDArray[np.bool_]:
+    """Return a mask (n,) of the feasible points that no other feasible point dominates.
+
+    Of equal points only the first is marked. A point with a NaN or infinite objective is never
+    marked.
+
+    Args:
+        objectives: (n, n_obj) points.
+        feasible: (n,) True for feasible points; None if all are feasible.
+    """
+    # Not imported at the top: moocore takes long to start.
+    import moocore
+
+    values = np.asarray(objectives, dtype=np.float64)
+    candidates = np.isfinite(values).all(axis=1)
+    if feasible is not None:
+        candidates &= np.asarray(feasible, dtype=bool)
+    mask = np.zeros(len(values), dtype=bool)
+    index = np.flatnonzero(candidates)
+    if len(index) > 0:
+        mask[index[moocore.is_nondominated(values[index])]] = True
+    return mask
+
+
+def front_rows(objectives: ArrayLike, feasible: ArrayLike | None = None) -> NDArray[np.intp]:
+    """Return the row indices (k,) of the non-dominated feasible points, sorted by first objective,
+    then by the next ones.
+
+    Args:
+        objectives: (n, n_obj) points.
+        feasible: (n,) True for feasible points; None if all are feasible.
+    """
+    values = np.asarray(objectives, dtype=np.float64)
+    rows = np.flatnonzero(non_dominated(values, feasible))
+    return rows[np.lexsort(values[rows].T[::-1])]
+
+
+def front_of(objectives: ArrayLike, feasible: ArrayLike | None = None) -> Array:
+    """Return the objectives (k, n_obj) of the non-dominated feasible points, by increasing first
+    objective.
+
+    Args:
+        objectives: (n, n_obj) points.
+        feasible: (n,) True for feasible points; None if all are feasible.
+    """
+    values = np.asarray(objectives, dtype=np.float64)
+    return np.asarray(values[front_rows(values, feasible)])

@@ -17,13 +17,11 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from symbolic.array import Array, Count
 from symbolic.records import Task
 from symbolic.records.task import variable_names
-
-Mask = NDArray[np.bool_]
 
 REFERENCE_POINT = (1.1, 1.1)
 """Reference point of the hypervolume, in normalised objectives (the paper's)."""
@@ -53,57 +51,9 @@ def normalise(objectives: ArrayLike, ideal: ArrayLike, nadir: ArrayLike) -> Arra
     return np.asarray((np.asarray(objectives, dtype=np.float64) - low) / (high - low))
 
 
-def non_dominated(objectives: ArrayLike, feasible: ArrayLike | None = None) -> Mask:
-    """Return a mask (n,) of the feasible points that no other feasible point dominates.
-
-    Of equal points only the first is marked. A point with a NaN or infinite objective is never
-    marked.
-
-    Args:
-        objectives: (n, n_obj) points.
-        feasible: (n,) True for feasible points; None if all are feasible.
-    """
-    import moocore
-
-    values = np.asarray(objectives, dtype=np.float64)
-    candidates = np.isfinite(values).all(axis=1)
-    if feasible is not None:
-        candidates &= np.asarray(feasible, dtype=bool)
-    mask = np.zeros(len(values), dtype=bool)
-    index = np.flatnonzero(candidates)
-    if len(index) > 0:
-        mask[index[moocore.is_nondominated(values[index])]] = True
-    return mask
-
-
-def front_rows(objectives: ArrayLike, feasible: ArrayLike | None = None) -> NDArray[np.intp]:
-    """Return the row indices (k,) of the non-dominated feasible points, sorted by first objective,
-    then by the next ones.
-
-    Args:
-        objectives: (n, n_obj) points.
-        feasible: (n,) True for feasible points; None if all are feasible.
-    """
-    values = np.asarray(objectives, dtype=np.float64)
-    rows = np.flatnonzero(non_dominated(values, feasible))
-    return rows[np.lexsort(values[rows].T[::-1])]
-
-
 def reference_point(n_obj: int) -> tuple[float, ...]:
     """Return the paper's reference point of the hypervolume for `n_obj` objectives."""
     return (REFERENCE_POINT[0],) * n_obj
-
-
-def front_of(objectives: ArrayLike, feasible: ArrayLike | None = None) -> Array:
-    """Return the objectives (k, n_obj) of the non-dominated feasible points, by increasing first
-    objective.
-
-    Args:
-        objectives: (n, n_obj) points.
-        feasible: (n,) True for feasible points; None if all are feasible.
-    """
-    values = np.asarray(objectives, dtype=np.float64)
-    return np.asarray(values[front_rows(values, feasible)])
 
 
 def hypervolume(front: ArrayLike, reference: ArrayLike = REFERENCE_POINT) -> float:

@@ -19,7 +19,7 @@ import casadi
 import numpy as np
 
 from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, CandidateEvaluator, Evaluations
-from hybrid_opt.indicators import metrics
+from hybrid_opt.evaluate.objectives import non_dominated
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.records import Aim, PolishOutcome, Status
 from hybrid_opt.polishing.settings import PolishSettings
@@ -90,7 +90,7 @@ class ParetoArchive:
     def front_indices(self) -> list[int]:
         """Return the indices of the non-dominated points, sorted by their first objective."""
         values = np.array(self.objectives)
-        kept = np.flatnonzero(metrics.non_dominated(values))
+        kept = np.flatnonzero(non_dominated(values))
         return [int(k) for k in kept[np.lexsort(values[kept].T[::-1])]]
 
     def best(self, objective: int | None) -> tuple[int, float]:

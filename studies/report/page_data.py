@@ -14,7 +14,7 @@ import numpy as np
 from hybrid_opt.campaign.stages import Cells, cells_of, ready_cells
 from hybrid_opt.display.objects import ARM_COLOURS
 from hybrid_opt.display.scene import packed, scene_data
-from hybrid_opt.indicators.metrics import front_of
+from hybrid_opt.evaluate.objectives import front_of
 from hybrid_opt.recommending.recommendation import ABOVE_STILL, level_force
 from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.workers import LocalWorkers, Workers

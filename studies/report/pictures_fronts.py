@@ -13,7 +13,8 @@ from matplotlib.ticker import MaxNLocator
 
 from hybrid_opt.display.table import counted
 from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS
-from hybrid_opt.indicators.metrics import best_so_far, front_of
+from hybrid_opt.evaluate.objectives import front_of
+from hybrid_opt.indicators.metrics import best_so_far
 from hybrid_opt.indicators.statistics import attainment_surfaces
 from studies.report.data import AlgorithmRuns, ReportData
 from studies.report.drawing import (

@@ -28,6 +28,7 @@ from pymoo.problems.multi.zdt import ZDT, ZDT1, ZDT2, ZDT3
 from hybrid_opt import metaheuristics
 from hybrid_opt.campaign.settings import sized
 from hybrid_opt.display.table import number, text_table
+from hybrid_opt.evaluate.objectives import front_of
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.metrics import normalise
 from hybrid_opt.indicators.statistics import RankTest, Summary, corrected, rank_test, summarise
@@ -152,7 +153,7 @@ class _AlgorithmRun:
 
 
 def _indicators(target: AnalyticProblem, points: Evaluated) -> tuple[float, float]:
-    front = target.normalise(metrics.front_of(points.objectives, points.feasible))
+    front = target.normalise(front_of(points.objectives, points.feasible))
     return metrics.hypervolume(front), metrics.igd(front, target.normalise(target.front))
 
 

@@ -14,7 +14,8 @@ import numpy as np
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import counted
 from hybrid_opt.evaluate.evaluation import Evaluations, LockedEvaluator
-from hybrid_opt.indicators.metrics import front_rows, hypervolume
+from hybrid_opt.evaluate.objectives import front_rows
+from hybrid_opt.indicators.metrics import hypervolume
 from hybrid_opt.metaheuristics.run import SearchSettings, search_carries
 from studies.program import load_workcell
 from symbolic.errors import SettingsError

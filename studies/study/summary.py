@@ -31,6 +31,7 @@ from hybrid_opt.campaign.settings import (
 )
 from hybrid_opt.carry import Carry
 from hybrid_opt.errors import ResultsError
+from hybrid_opt.evaluate.objectives import front_of
 from hybrid_opt.front import Front, SelectedCarry, select
 from hybrid_opt.indicators import metrics
 from hybrid_opt.indicators.metrics import BindingBound, binding_bounds
@@ -327,7 +328,7 @@ exact test can reach, 2 / binomial(2 n, n), is 0.028 or more before any correcti
 def reference_front(fronts: Sequence[Array]) -> Array:
     """Return the non-dominated points (k, n_obj) of the union of fronts, each (n, n_obj). The union
     of all fronts of a campaign gives its reference front for the IGD."""
-    return metrics.front_of(np.concatenate(fronts))
+    return front_of(np.concatenate(fronts))
 
 
 def front_indicators(

@@ -19,7 +19,7 @@ from hybrid_opt.campaign.candidates import decode
 from hybrid_opt.campaign.search_stage import SearchRequest, search_replica
 from hybrid_opt.campaign.settings import CampaignSettings
 from hybrid_opt.errors import ResultsError
-from hybrid_opt.indicators import metrics
+from hybrid_opt.evaluate.objectives import non_dominated
 from hybrid_opt.polishing.settings import FillSettings, ProbeSettings
 from hybrid_opt.store.bundle_file import read_manifest
 from hybrid_opt.store.files import sha256
@@ -101,7 +101,7 @@ def test_a_search_is_the_one_that_a_campaign_runs() -> None:
 
 
 def test_a_front_is_proven_and_not_dominated() -> None:
-    assert metrics.non_dominated(front().objectives).all()
+    assert non_dominated(front().objectives).all()
     assert (np.diff(front().objectives[:, 0]) > 0.0).all()
     for carry in front():
         assert carry.judgement is not None

@@ -12,8 +12,8 @@ from hybrid_opt.branches import BranchCompetition, search_branches
 from hybrid_opt.campaign import CampaignSettings, ExecutionSettings
 from hybrid_opt.campaign.stages import decided_cell, read_branches, store_branches
 from hybrid_opt.cell import Cell
-from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
-from hybrid_opt.indicators.metrics import front_rows, hypervolume
+from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, front_rows
+from hybrid_opt.indicators.metrics import hypervolume
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load
 from symbolic.read.cell_files import collect_cell, unpack_cell

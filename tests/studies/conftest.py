@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from hybrid_opt.campaign.results import read_campaign
-from hybrid_opt.indicators.metrics import non_dominated
+from hybrid_opt.evaluate.objectives import non_dominated
 from hybrid_opt.polishing.records import PolishedFront, PolishEffort
 from studies.report import PAGE
 from studies.report.data import ReportData, ReportRun, gather

@@ -26,7 +26,7 @@ from hybrid_opt.collision.certify import (
 )
 from hybrid_opt.collision.checker import BodyDistances, CollidingPair, CollisionChecker
 from hybrid_opt.evaluate.evaluation import BETWEEN_SAMPLES, REASONS, CandidateEvaluator
-from hybrid_opt.indicators.metrics import non_dominated
+from hybrid_opt.evaluate.objectives import non_dominated
 from hybrid_opt.metaheuristics.run import CarryProblem
 from symbolic.array import Array
 from symbolic.errors import SettingsError

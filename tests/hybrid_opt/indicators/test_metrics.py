@@ -35,10 +35,6 @@ points = st.integers(1, 12).flatmap(
 )
 
 
-def dominates(a: Array, b: Array) -> bool:
-    return bool((a <= b).all() and (a < b).any())
-
-
 def test_hypervolume_by_hand() -> None:
     # Two rectangles: 0.9 x 0.3 below (0.2, 0.8) and 0.5 x 0.6 more down to (0.6, 0.2).
     assert metrics.hypervolume([[0.2, 0.8], [0.6, 0.2]]) == pytest.approx(0.27 + 0.30)
@@ -55,23 +51,6 @@ def test_hypervolume_grows_by_points_not_dominated_only(front: Array, extra: Arr
     assert after >= before - 1e-12
     if any((p <= extra).all() for p in front):
         assert after == pytest.approx(before, abs=1e-12)
-
-
-@given(points)
-def test_non_dominated_is_the_definition(front: Array) -> None:
-    feasible = front[:, 0] < 1.0
-    mask = metrics.non_dominated(front, feasible)
-    for index, point in enumerate(front):
-        beaten = any(dominates(q, point) for q in front[feasible])
-        repeated = any((q == point).all() for q in front[:index][feasible[:index]])
-        assert mask[index] == (feasible[index] and not beaten and not repeated)
-
-
-def test_non_dominated_refuses_what_is_not_finite() -> None:
-    values = [[np.nan, 0.0], [-np.inf, 0.0], [1.0, 1.0], [np.inf, -1.0]]
-    np.testing.assert_array_equal(metrics.non_dominated(values), [False, False, True, False])
-    np.testing.assert_array_equal(metrics.front_of(values), [[1.0, 1.0]])
-    assert len(metrics.front_of([[np.nan, 1.0]])) == 0
 
 
 def test_igd_is_the_mean_euclidean_distance() -> None:

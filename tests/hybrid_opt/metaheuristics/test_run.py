@@ -15,6 +15,7 @@ from pymoo.problems.multi.tnk import TNK
 from scipy.optimize import minimize
 
 from hybrid_opt.evaluate.evaluation import FEASIBLE, NOT_FINITE, REASONS, Evaluations
+from hybrid_opt.evaluate.objectives import non_dominated
 from hybrid_opt.indicators import metrics
 from hybrid_opt.metaheuristics import (
     SearchResult,
@@ -122,7 +123,7 @@ def test_front_holds_finite_feasible_points_only(name: str, constraints: int) ->
     assert np.isfinite(result.front.objectives).all()
     if constraints:
         assert (result.front.decisions[:, 0] >= 0.4).all()
-    assert metrics.non_dominated(result.front.objectives).all()
+    assert non_dominated(result.front.objectives).all()
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -351,7 +352,7 @@ def test_front_has_its_known_range_and_volume(name: str) -> None:
     # A finite sample of the front stays below the limit, by less than its resolution.
     reached = metrics.hypervolume(target.normalise(target.front))
     assert volume - 1e-3 < reached <= volume + 5e-5
-    assert metrics.non_dominated(target.front).all()
+    assert non_dominated(target.front).all()
 
 
 @pytest.mark.heavy

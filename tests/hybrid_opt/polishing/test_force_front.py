@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.evaluate.objectives import front_of, non_dominated
 from hybrid_opt.indicators import metrics
-from hybrid_opt.indicators.metrics import front_of
 from hybrid_opt.polishing import polisher as polisher_module
 from hybrid_opt.polishing.force import ForceSolver, Scalarisation, SolveMode, pascoletti_serafini
 from hybrid_opt.polishing.force_front import (
@@ -64,7 +64,7 @@ def start_front() -> Array:
     rng = np.random.default_rng(5)
     x = rng.uniform(evaluator().lower, evaluator().upper, (600, evaluator().n_var))
     found = evaluator().certified(evaluator().evaluate(x))
-    return np.asarray(x[metrics.non_dominated(found.objectives, found.feasible)])
+    return np.asarray(x[non_dominated(found.objectives, found.feasible)])
 
 
 @cache
@@ -98,7 +98,7 @@ def test_the_front_gets_better_and_no_point_is_lost() -> None:
     assert metrics.hypervolume(after) > metrics.hypervolume(before)
     for point in before:
         assert np.any(np.all(after <= point, axis=1))
-    assert metrics.non_dominated(after).all()
+    assert non_dominated(after).all()
 
 
 def test_what_probes_reach_is_given_up_only_where_the_front_is_nearly_as_good() -> None:

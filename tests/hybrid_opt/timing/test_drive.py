@@ -13,8 +13,11 @@ from hybrid_opt import metaheuristics
 from hybrid_opt.carry import DRIVE_CONSTRAINTS
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator
-from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, ROBUST_DRIVABLE_OBJECTIVES
-from hybrid_opt.indicators.metrics import non_dominated
+from hybrid_opt.evaluate.objectives import (
+    DRIVABLE_OBJECTIVES,
+    ROBUST_DRIVABLE_OBJECTIVES,
+    non_dominated,
+)
 from hybrid_opt.metaheuristics.run import CarryProblem
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.timing.analysis import drivable_timing

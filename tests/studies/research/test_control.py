@@ -11,6 +11,7 @@ import pytest
 
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.errors import ResultsError
+from hybrid_opt.evaluate.objectives import front_of
 from hybrid_opt.indicators import metrics
 from hybrid_opt.progress import Progress
 from studies.research import longer_searches
@@ -49,7 +50,7 @@ def test_distance_to_a_reference_front(polished: Path) -> None:
     own = read_campaign(polished)
     fronts = [front.objectives for front in own.fronts if front.polished]
     assert len(fronts) == 2
-    union = metrics.front_of(np.concatenate(fronts))
+    union = front_of(np.concatenate(fronts))
     reference = ReferenceFront(own.workcell.digest, union, np.empty((len(union), 0)))
     (found,) = longer_searches.approaches(polished, reference)
     gaps = [metrics.hypervolume(union) - metrics.hypervolume(r.front) for r in own.replicas]
@@ -58,7 +59,7 @@ def test_distance_to_a_reference_front(polished: Path) -> None:
     assert found.polished_igd < found.search_igd
     assert found.closed == pytest.approx(100.0 * (1.0 - found.polished_gap / found.search_gap))
     assert "NSGA-II" in longer_searches.approaches_text([found])
-    searched = metrics.front_of(np.concatenate([r.front for r in own.replicas[:1]]))
+    searched = front_of(np.concatenate([r.front for r in own.replicas[:1]]))
     own_front = ReferenceFront(own.workcell.digest, searched, np.empty((len(searched), 0)))
     assert longer_searches.approaches(polished, own_front)  # the gap to it may be none
     with refused(ResultsError, "another-workcell"):

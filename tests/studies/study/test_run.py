@@ -22,7 +22,7 @@ import hybrid_opt as ho
 from hybrid_opt.campaign import ExecutionSettings, Stage, open_folder, run_stages
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.errors import NoCarryError
-from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
+from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES, front_of
 from hybrid_opt.indicators import metrics
 from hybrid_opt.progress import Progress
 from hybrid_opt.recommending.choice import Wish
@@ -82,7 +82,7 @@ def test_study_leaves_everything_behind(program_run: tuple[Path, str]) -> None:
         assert not (found.x[1:40] == initial).all(axis=1).any()
     reference = np.loadtxt(root / "fronts/reference.csv", delimiter=",", skiprows=1, ndmin=2)
     union = np.concatenate([replica.front for replica in results.replicas])
-    np.testing.assert_array_equal(reference, metrics.front_of(union))
+    np.testing.assert_array_equal(reference, front_of(union))
     levels = np.loadtxt(root / "fronts/mopso-attainment.csv", delimiter=",", skiprows=1, ndmin=2)
     assert set(levels[:, 0]) == {25.0, 50.0, 75.0, 100.0}
     assert "Table 1" in printed
@@ -168,7 +168,7 @@ def test_drivable_fronts_are_polished_as_one_and_others_replica_by_replica(study
     (union,) = drivable.to_polish
     assert union.key == ("union", 0)
     points = np.concatenate([replica.front for replica in drivable.replicas])
-    np.testing.assert_array_equal(union.objectives, metrics.front_of(points))
+    np.testing.assert_array_equal(union.objectives, front_of(points))
     every = np.concatenate([replica.front_x for replica in drivable.replicas])
     assert (union.x[:, None] == every).all(axis=2).any(axis=1).all()
     assert drivable.cell.evaluate(union.x).feasible.all()
