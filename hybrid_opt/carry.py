@@ -20,9 +20,8 @@ from hybrid_opt.indicators.metrics import excess_above_static
 from hybrid_opt.static_hold import payload_limit, static_hold
 from symbolic.array import Array, set_read_only
 from symbolic.contact.registry import contact_model
-from symbolic.path.spline import sample_basis
+from symbolic.path.spline import sample_basis, waypoints_of
 from symbolic.records import Workcell
-from symbolic.records.task import waypoints_of
 
 OBJECTIVE = "objective_"
 """Prefix of an objective's name among a carry's figures."""

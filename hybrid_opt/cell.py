@@ -31,7 +31,7 @@ from hybrid_opt.static_hold import StaticHold, hold_error, static_hold, static_h
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.geometry.pairs import CellGeometry
-from symbolic.path.pieces import coarse_task, resample_decisions
+from symbolic.path.spline import coarse_task, resample_decisions
 from symbolic.read.cell import changed, load
 from symbolic.read.cell_files import CellFiles, collect_cell, drivable_files, unpack_cell
 from symbolic.records import Workcell

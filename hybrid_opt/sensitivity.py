@@ -34,11 +34,10 @@ from symbolic import safe_io
 from symbolic.array import Array
 from symbolic.errors import SettingsError, WorkcellError
 from symbolic.parameters import WorkcellParameters
-from symbolic.path.spline import path_basis, sample_basis
+from symbolic.path.spline import path_basis, sample_basis, waypoints_of
 from symbolic.path.time_law import timed_path
 from symbolic.read.cell import changed
 from symbolic.records import Workcell
-from symbolic.records.task import waypoints_of
 
 NUMBER_STEP = 1e-5
 """Half the difference of a number between the two neighbouring cells from which derivatives are

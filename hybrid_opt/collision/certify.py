@@ -26,9 +26,8 @@ from hybrid_opt.collision.between import (
 from hybrid_opt.collision.checker import CollidingPair, CollisionChecker
 from symbolic.array import Array
 from symbolic.errors import DualArmError, SettingsError
-from symbolic.path.spline import path_position
+from symbolic.path.spline import path_position, place_redundant
 from symbolic.records import POSE_SIZE, Task
-from symbolic.records.task import place_redundant
 from symbolic.robot.arm import REACH_TOLERANCE
 
 Configuration = Callable[[Array], tuple[Array, Array, Array]]

@@ -44,8 +44,8 @@ from hybrid_opt.evaluate.objectives import (
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.functions import CONSTRAINTS, SAMPLE_NAMES
+from symbolic.path.spline import extended_waypoints
 from symbolic.records import Workcell
-from symbolic.records.task import extended_waypoints
 
 if TYPE_CHECKING:
     from hybrid_opt.timing.path_timer import CandidateDriver

@@ -27,7 +27,7 @@ from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
 from hybrid_opt.timing.records import TimingLimits
 from symbolic.array import Array
 from symbolic.errors import DualArmError, WorkcellError
-from symbolic.path.pieces import coarse_task, resample_decisions
+from symbolic.path.spline import coarse_task, resample_decisions
 from symbolic.read.cell_files import collect_cell, unpack_cell
 from symbolic.records import POSE_SIZE, Workcell
 from symbolic.records.poses import box_placement, inverse, rpy_from_rotation, transform

@@ -59,8 +59,8 @@ from symbolic.errors import SettingsError
 from symbolic.geometry.bodies import CollisionBody
 from symbolic.geometry.pairs import ActivePair, CellGeometry, build_geometry, ignored_pairs
 from symbolic.geometry.pieces import support
+from symbolic.path.spline import extended_waypoints
 from symbolic.records import PAYLOAD_NAME, AllowedContact, Handling, Waypoint, Workcell
-from symbolic.records.task import extended_waypoints
 
 LARGEST_DROP = 0.3
 """Largest distance below the carry's ends within which a support of the box is looked for [m]."""

@@ -32,7 +32,7 @@ from hybrid_opt.metaheuristics.algorithms import (
 from hybrid_opt.metaheuristics.mopso import Mopso, MopsoSettings
 from symbolic.array import Array, require_allowed, set_read_only
 from symbolic.errors import SettingsError
-from symbolic.path.pieces import coarse_task, resample_decisions
+from symbolic.path.spline import coarse_task, resample_decisions
 from symbolic.records import Task
 from symbolic.records.problems import shown
 

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from hybrid_opt.polishing.cell import SmoothCell
 from symbolic.array import Array
 from symbolic.contact.registry import contact_model
-from symbolic.records.task import POSE_SIZE, place_redundant
+from symbolic.path.spline import place_redundant
+from symbolic.records.task import POSE_SIZE
 from symbolic.robot.arm import REACH_TOLERANCE
 from symbolic.smooth.path_points import ManipulabilityLimit
 

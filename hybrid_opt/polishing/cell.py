@@ -18,9 +18,9 @@ from symbolic.array import Array
 from symbolic.cell_model import CellBodies, CellModel
 from symbolic.contact.registry import contact_model
 from symbolic.limit_coefficients import TIMING_BARRIER_WEIGHT
-from symbolic.path.spline import path_basis
+from symbolic.path.spline import extended_waypoints, path_basis
 from symbolic.records.cell import Workcell
-from symbolic.records.task import POSE_SIZE, Task, extended_waypoints
+from symbolic.records.task import POSE_SIZE, Task
 from symbolic.smooth.driven import driven_functions
 from symbolic.smooth.passage import GAPS, AxisSwitchGap, SeparatingAxisGap, gap_function
 from symbolic.smooth.path_points import (

@@ -47,9 +47,9 @@ from hybrid_opt.timing.path_timer import CandidateDriver, TimedCandidate
 from symbolic.array import Array
 from symbolic.contact.registry import command_model
 from symbolic.errors import SettingsError
-from symbolic.path.pieces import coarse_entries, hierarchical_basis
+from symbolic.path.spline import coarse_entries, hierarchical_basis, waypoints_of
 from symbolic.records import Workcell
-from symbolic.records.task import initial_decision, waypoints_of
+from symbolic.records.task import initial_decision
 
 FIRST_DRIVE_RADIUS, LEAST_DRIVE_RADIUS = 0.3, 1e-4
 """First radius of the trust region, and radius below which a solve ends [half ranges of the

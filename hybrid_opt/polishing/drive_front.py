@@ -26,7 +26,7 @@ from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_timer import CandidateDriver
 from hybrid_opt.timing.solve import drive_path
 from symbolic.array import Array
-from symbolic.path.pieces import coarse_task, resample_decisions
+from symbolic.path.spline import coarse_task, resample_decisions
 
 LEAST_GAP = 0.02
 """Gaps narrower than this are not filled [front's extent]."""

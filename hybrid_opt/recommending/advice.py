@@ -26,7 +26,7 @@ from symbolic.array import Array
 from symbolic.contact.registry import contact_model
 from symbolic.records import Contact, Workcell
 from symbolic.records.poses import box_rotation
-from symbolic.records.task import POSE_SIZE, components
+from symbolic.records.task import POSE_SIZE
 
 MARGIN_BISECTIONS = 20
 
@@ -312,7 +312,7 @@ def _of_pitch(cell: Cell, path: Array, option: Option, slope: float) -> Iterator
             other = path.copy()
             other[POSE_SIZE * place + PITCH] += sign * DEGREE_CHANGE
             varied.append(other)
-            name = components(task.orientation)[PITCH]
+            name = task.pose_names[PITCH]
             names.append(f"{sign:+.0f} degree of {name} at via-point {place + 1}")
     for one in DrivenPaths(cell, np.array(varied)).options(option.limit):
         harder = one.commanded - option.commanded

@@ -40,7 +40,7 @@ from hybrid_opt.timing.solve import (
 )
 from symbolic.array import AllowMissing, Array, Count, Figure, Pair, Row, Shape
 from symbolic.errors import SettingsError
-from symbolic.path.pieces import resample_decisions
+from symbolic.path.spline import resample_decisions
 from symbolic.records import Workcell
 
 LEAST_FORCE_RATIO = 1.001

@@ -33,7 +33,7 @@ from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.contact.registry import contact_model
 from symbolic.errors import DualArmError
-from symbolic.path.pieces import resample_decisions
+from symbolic.path.spline import resample_decisions
 from symbolic.records import Workcell
 
 RECOMMENDED_LABEL = "recommended"

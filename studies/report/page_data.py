@@ -27,7 +27,7 @@ from studies.report.page_carries import (
     page_trajectory,
 )
 from symbolic.array import Array, evenly
-from symbolic.path.pieces import resample_decisions
+from symbolic.path.spline import resample_decisions
 from symbolic.read.cell_files import cell_to_json
 from symbolic.records import Workcell
 

@@ -47,7 +47,7 @@ from hybrid_opt.store.trajectory_file import write_trajectory
 from hybrid_opt.timing.jerk import applicable_jerk_limits
 from hybrid_opt.timing.robustness import Margin
 from symbolic.array import Array, Count, Figure, Pair
-from symbolic.path.pieces import resample_decisions
+from symbolic.path.spline import resample_decisions
 from symbolic.records import Task, Workcell
 
 

@@ -183,7 +183,7 @@ def _build(
     workcell = replace(workcell, payload=replace(workcell.payload, velocity_max=slowed))
     if workcell.task.pieces > 1 and not problems.found:
         # Not imported at the top: it needs CasADi.
-        from symbolic.path.pieces import refined_task
+        from symbolic.path.spline import refined_task
 
         workcell = replace(workcell, task=refined_task(workcell.task))
     return replace(workcell, reading=reading_of(workcell, identity)) if identity else workcell

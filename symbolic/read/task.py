@@ -41,7 +41,6 @@ from symbolic.records.poses import (
     rotation_from_rpy,
 )
 from symbolic.records.problems import Problems, shown
-from symbolic.records.task import components
 from symbolic.records.time_law import CONSTANT, TIME_LAWS, TimeLaw
 
 MAX_WAYPOINTS = 100
@@ -61,7 +60,7 @@ def read_task(table: TableReader, holding: Array) -> tuple[Task, tuple[Redundanc
         holding: holding force of each arm's hand, 0 for a pad [N].
     """
     orientation = _orientation(table)
-    names = components(orientation)
+    names = ("x", "y", "z", *orientation.components)
     start = _fixed(table, "start")
     between = [w for entry in table.tables("waypoints") for w in _waypoints(entry, names)]
     waypoints = (start, *between, _fixed(table, "goal"))

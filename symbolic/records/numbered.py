@@ -111,7 +111,7 @@ class NumberedJoint(RedundantJoint):
         return np.array(self.free, dtype=np.bool_)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class NumberedTask(Task):
     """A task with symbols as parameters.
 

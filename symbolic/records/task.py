@@ -1,14 +1,12 @@
 """The task of a carry, and its decision vector.
 
 The decision vector holds the free waypoints of a task's path in order, then the free values of the
-redundant joints, joint by joint; in drivable cells the force limit [N] is the last entry. The
-functions here convert between decision vectors and paths as numbers.
-`symbolic.path.spline.waypoint_matrix` and `extended_matrix` do so as expressions.
+redundant joints, joint by joint; in drivable cells the force limit [N] is the last entry.
+`symbolic.path.spline` computes the waypoints of a decision vector.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated
@@ -94,9 +92,10 @@ class AllowedContact:
     departure: Annotated[float, quantity.DEPARTURE]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True, kw_only=True, eq=False)
 class Task:
-    """The box path to plan, its sampling, and the settings of forces and time.
+    """The box path to plan, its sampling, and the settings of forces and time. Two records are
+    equal only if they are the same object, so that results can be cached by task.
 
     Attributes:
         waypoints: poses of the path in order; the first and the last are fixed.
@@ -114,7 +113,7 @@ class Task:
         redundant: joints whose paths are part of the decision vector.
         orientation: convention of the last three numbers of every pose.
         pieces: number of pieces of the path between two waypoints of the file
-            (`symbolic.path.pieces`).
+            (`symbolic.path.spline.refined_task`).
     """
 
     waypoints: tuple[Waypoint, ...]
@@ -131,6 +130,11 @@ class Task:
     redundant: tuple[RedundantJoint, ...] = ()
     orientation: Orientation = field(default_factory=Orientation)
     pieces: int = 1
+
+    @cached_property
+    def pose_names(self) -> tuple[str, ...]:
+        """Names of the six entries of a pose in the task's orientation convention."""
+        return ("x", "y", "z", *self.orientation.components)
 
     @cached_property
     def extended_size(self) -> int:
@@ -186,7 +190,10 @@ class Task:
     def initial_time(self) -> float:
         """Duration of the hand-made trajectory on straight lines between its waypoints, at the
         reference speeds [s]."""
-        steps = np.diff(waypoints_of(self, initial_decision(self)), axis=0)
+        points = self.fixed_waypoints[:, :POSE_SIZE].copy()
+        points[list(self.free_indices)] = self.initial
+        points[:, 3:] = self.orientation.unwrapped(points[:, 3:])
+        steps = np.diff(points, axis=0)
         lengths = np.linalg.norm(steps[:, :3], axis=1) / self.reference_speed
         turns = np.linalg.norm(steps[:, 3:], axis=1) / self.reference_angular_speed
         return float(np.maximum(lengths, turns).sum())
@@ -232,57 +239,6 @@ class Task:
 # --- the decision vector ---
 
 
-def components(orientation: Orientation) -> tuple[str, ...]:
-    """Return the names of the six entries of a pose in this orientation convention."""
-    return ("x", "y", "z", *orientation.components)
-
-
-def waypoints_of(task: Task, x: Array) -> Array:
-    """Return the box poses at all waypoints of decision vectors, with unwrapped angles.
-
-    Args:
-        task: task with n_waypoints waypoints, fixed and free.
-        x: (..., n_var) decision vectors.
-
-    Returns:
-        (..., n_waypoints, 6) poses [m, rad].
-    """
-    return extended_waypoints(task, x)[..., :POSE_SIZE]
-
-
-def extended_waypoints(task: Task, x: Array) -> Array:
-    """Return the box poses and redundant joints at all waypoints of decision vectors, with
-    unwrapped angles.
-
-    Args:
-        task: task with n_waypoints waypoints and m redundant joints.
-        x: (..., n_var) decision vectors.
-
-    Returns:
-        (..., n_waypoints, 6 + m) poses [m, rad], then redundant joints [rad or m].
-    """
-    points = np.empty((*x.shape[:-1], *task.fixed_waypoints.shape))
-    points[...] = task.fixed_waypoints
-    rows, columns = task.free_entries
-    points[..., rows, columns] = x[..., : task.n_path]
-    points[..., 3:POSE_SIZE] = task.orientation.unwrapped(points[..., 3:POSE_SIZE])
-    return points
-
-
-def place_redundant(task: Task, extended: Array, joints: Sequence[Array]) -> None:
-    """Copy the redundant joints of n extended poses into the joint positions of both arms, in
-    place.
-
-    Args:
-        task: task with m redundant joints.
-        extended: (n, 6 + m) box poses, then redundant joints.
-        joints: for each arm its joint positions (n, joints), which are changed.
-    """
-    for arm, q in enumerate(joints):
-        for joint, place in task.redundant_places[arm]:
-            q[:, joint] = extended[:, place]
-
-
 def decision_of(task: Task, waypoints: Array) -> Array:
     """Return the decision vector (n_var,) of a path through given waypoints. In drivable cells its
     force limit is the upper bound.
@@ -324,7 +280,7 @@ def straight_line(task: Task) -> Array:
 def variable_names(task: Task) -> tuple[str, ...]:
     """Return a name for each of the n_var decision variables, such as 'waypoint 1, x'. The start is
     waypoint 0."""
-    names = [*components(task.orientation), *(joint.name for joint in task.redundant)]
+    names = [*task.pose_names, *(joint.name for joint in task.redundant)]
     rows, columns = task.free_entries
     found = [f"waypoint {row}, {names[column]}" for row, column in zip(rows, columns, strict=True)]
     return tuple(found + ["force limit"] * (task.n_var - task.n_path))

@@ -17,11 +17,11 @@ import numpy as np
 
 from symbolic.array import Array
 from symbolic.expression import named_function
-from symbolic.path.spline import sample_basis
+from symbolic.path.spline import extended_waypoints, sample_basis
 from symbolic.records import POSE_SIZE, Contact, Robot, Workcell
 from symbolic.records.cell import box_flange
 from symbolic.records.poses import box_placement, inverse
-from symbolic.records.task import extended_waypoints, initial_decision
+from symbolic.records.task import initial_decision
 from symbolic.robot.arm import TRACK_OUTPUTS, follow_function, following_columns, pose_error
 from symbolic.robot.model import RobotModel
 

@@ -20,8 +20,9 @@ from studies.research.plain.candidate import PlainJudge
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.geometry.bodies import Frame
+from symbolic.path.spline import extended_waypoints
 from symbolic.records.poses import box_rotation
-from symbolic.records.task import extended_waypoints, variable_names
+from symbolic.records.task import variable_names
 from tests.odd_cells import free_pandas, turned_transfer
 
 

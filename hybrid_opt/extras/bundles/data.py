@@ -21,7 +21,6 @@ from hybrid_opt.store.files import csv_text
 from symbolic.array import Array
 from symbolic.read.arms import arm_model, link_frame, turning_joints
 from symbolic.records.poses import box_placement, box_rotation
-from symbolic.records.task import components
 
 SCHEMA = "job.schema.json"
 
@@ -56,7 +55,7 @@ def job_table(export: Export) -> str:
     """
     job, sampled = export.job, export.sampled
     robots = [robot.name for robot in job.workcell.robots]
-    pose = zip(components(job.workcell.task.orientation), _POSE_UNITS, strict=True)
+    pose = zip(job.workcell.task.pose_names, _POSE_UNITS, strict=True)
     header = ["time [s]", "phase", *(f"box {name} [{unit}]" for name, unit in pose)]
     columns = [sampled.pose]
     known = zip(export.joint_columns.items(), _JOINT_UNITS, strict=True)

@@ -31,11 +31,12 @@ from hybrid_opt.metaheuristics.run import CarryProblem
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.geometry.pairs import build_geometry
+from symbolic.path.spline import extended_waypoints
 from symbolic.read.cell import load
 from symbolic.records import Body, Box
 from symbolic.records.cell import box_flange
 from symbolic.records.poses import inverse, pose_matrix
-from symbolic.records.task import extended_waypoints, initial_decision
+from symbolic.records.task import initial_decision
 from symbolic.robot.model import build_robot_model
 from tests.hybrid_opt.cells import shipped
 from tests.hybrid_opt.collision.test_checker import check_between, collision_mask

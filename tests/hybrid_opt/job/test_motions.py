@@ -14,10 +14,9 @@ from hybrid_opt.timing.jerk import time_with_jerk
 from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
 from hybrid_opt.timing.solve import check_limits, most_used, time_path
 from symbolic.contact.registry import command_model
-from symbolic.path.spline import path_basis
+from symbolic.path.spline import path_basis, waypoints_of
 from symbolic.read.cell import load
 from symbolic.records.poses import box_rotation
-from symbolic.records.task import waypoints_of
 from tests.hybrid_opt.job.jobs import rack, rack_jobs, rack_timing
 from tests.symbolic.cells import RACK
 

@@ -31,7 +31,7 @@ from hybrid_opt.robust.squeeze import commanded_forces
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.errors import SettingsError
-from symbolic.path.pieces import resample_decisions
+from symbolic.path.spline import resample_decisions
 from symbolic.read.cell import changed
 from symbolic.records import USUAL_UNCERTAINTY, Contact, Task
 from symbolic.records.cell import RANGES

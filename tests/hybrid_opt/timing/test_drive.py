@@ -26,8 +26,9 @@ from hybrid_opt.timing.records import TimingLimits, TimingStatus
 from symbolic.array import Array
 from symbolic.functions import candidate_function
 from symbolic.geometry.clearance import screening_functions
+from symbolic.path.spline import waypoints_of
 from symbolic.records import Uncertainty, Workcell
-from symbolic.records.task import initial_decision, waypoints_of
+from symbolic.records.task import initial_decision
 from symbolic.robot.arm import posture_function
 from tests.hybrid_opt.timing.cells import by_toppra, hand_timing, near_initial, timing_of
 from tests.symbolic.cells import hand_cell, hand_model, with_task

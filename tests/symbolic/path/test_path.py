@@ -22,24 +22,28 @@ from studies.research.plain.motion import (
 )
 from symbolic.array import Array
 from symbolic.errors import WorkcellError
-from symbolic.path.pieces import (
-    coarse_entries,
-    coarse_task,
-    hierarchical_basis,
-    refined_task,
-    resample_decisions,
-)
 from symbolic.path.rotation import (
     angular_acceleration,
     angular_velocity,
     rotation_matrix,
 )
-from symbolic.path.spline import path_basis, path_position, sample_basis, waypoint_matrix
+from symbolic.path.spline import (
+    coarse_entries,
+    coarse_task,
+    extended_waypoints,
+    hierarchical_basis,
+    path_basis,
+    path_position,
+    refined_task,
+    resample_decisions,
+    sample_basis,
+    waypoint_matrix,
+)
 from symbolic.path.time_law import STEP_TIME_FLOOR, timed_path
 from symbolic.read.cell import load
 from symbolic.records import Task, Waypoint
 from symbolic.records.poses import Orientation, box_placement, box_rotation, rotation_from_rpy
-from symbolic.records.task import extended_waypoints, initial_decision
+from symbolic.records.task import initial_decision
 from tests.symbolic.cells import call, fixed, free, hand_cell, with_task
 from tests.symbolic.read.samples import RACK
 

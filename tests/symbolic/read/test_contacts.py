@@ -12,20 +12,14 @@ import pytest
 import trimesh
 
 from symbolic.errors import BundleError, WorkcellError
-from symbolic.path.pieces import coarse_task
+from symbolic.path.spline import coarse_task, extended_waypoints, waypoints_of
 from symbolic.read.arms import arm_model
 from symbolic.read.cell import load, with_branches
 from symbolic.read.cell_files import CellFiles, collect_cell, drivable_files, unpack_cell
 from symbolic.read.payload import pad_rotation
 from symbolic.read.task import best_conditioned, posture_path
 from symbolic.records import Cylinder, Mesh, Workcell
-from symbolic.records.task import (
-    decision_of,
-    extended_waypoints,
-    initial_decision,
-    straight_line,
-    waypoints_of,
-)
+from symbolic.records.task import decision_of, initial_decision, straight_line
 from tests.machines import SINGLE, single_cell
 from tests.odd_cells import PANDA_JOINT, free_pandas, rack_on_rail
 from tests.studies.conftest import TRANSFER

@@ -13,11 +13,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from symbolic.errors import WorkcellError
+from symbolic.path.spline import extended_waypoints
 from symbolic.read.cell import load
 from symbolic.records import Mesh, Workcell
 from symbolic.records.poses import Orientation, rotation_from_rpy
 from symbolic.records.problems import matching
-from symbolic.records.task import extended_waypoints, variable_names
+from symbolic.records.task import variable_names
 from tests.odd_cells import turned_transfer
 from tests.symbolic.read.samples import GOFA, sample_data, write
 
