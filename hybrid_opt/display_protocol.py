@@ -11,13 +11,13 @@ from pathlib import Path
 from typing import Any, Protocol
 
 
-def display(room: str) -> Any:
+def display(module: str) -> Any:
     """Import one of the modules that display objects.
 
     Args:
-        room: 'objects' for text and HTML, or 'scene' for three-dimensional views.
+        module: 'objects' for text and HTML, or 'scene' for three-dimensional views.
     """
-    return import_module(f"hybrid_opt.display.{room}")
+    return import_module(f"hybrid_opt.display.{module}")
 
 
 class Displayable:

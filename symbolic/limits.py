@@ -194,8 +194,8 @@ def limits_of_block(block: str) -> tuple[Limit, ...]:
 
 
 def passes_enumeration() -> str:
-    """Return C source text that declares the limits and the slack group of each, for the compiled
-    forward and backward passes of a timing.
+    """Return C source text that declares all limits, and the `group` of each limit, for the
+    compiled forward and backward passes of a timing.
     """
     groups = list(dict.fromkeys(limit.group for limit in LIMITS))
     names = ", ".join(limit.symbol for limit in LIMITS)

@@ -158,7 +158,7 @@ def grip_budget(workcell: Workcell) -> GripBudget:
     with the reference forces. Nothing is compiled.
 
     Raises:
-        SettingsError: some cases of the uncertainty cannot be held by any force, or the uncertainty
+        SettingsError: no force holds the box in some case of the uncertainty, or the uncertainty
             leaves no friction or contact patch.
     """
     model, motion = interpreted_robust_model(workcell), _ends_at_rest(workcell)
@@ -174,7 +174,7 @@ def required_at_rest(workcell: Workcell) -> Array:
     and goal in every case of the uncertainty.
 
     Raises:
-        SettingsError: some cases of the uncertainty cannot be held by any force, or the uncertainty
+        SettingsError: no force holds the box in some case of the uncertainty, or the uncertainty
             leaves no friction or contact patch.
     """
     return largest_forces(interpreted_robust_model(workcell), _ends_at_rest(workcell))

@@ -11,7 +11,7 @@ import numpy as np
 
 from hybrid_opt.display.table import Table, counted, number
 from hybrid_opt.extras.proposing.hold_map import (
-    HeldPlace,
+    HeldPose,
     HoldMap,
     HoldMapSettings,
     hold_map,
@@ -123,7 +123,7 @@ def _heights(found: HoldMap) -> ProgramResult:
     return ProgramResult({"name": name, **grid, "heights": values}, (table.text(),))
 
 
-def _best(found: HoldMap, best: HeldPlace) -> ProgramResult:
+def _best(found: HoldMap, best: HeldPose) -> ProgramResult:
     """Return the best box pose and the contacts that hold it, in the form of a workcell file."""
     robots = found.geometry.workcell.robots
     held = " and ".join(
@@ -212,11 +212,11 @@ def draw(found: HoldMap, output: Path) -> tuple[str, ...]:
     # Not imported at the top: without a picture nothing of it is needed.
     from studies.programs.inspection import make_folder
     from studies.report.drawing import in_style, save, settled
-    from studies.report.pictures_reach import holdable_places
+    from studies.report.pictures_reach import holdable_positions
 
     make_folder(output)
     with in_style():
-        figure = settled(holdable_places(found))
+        figure = settled(holdable_positions(found))
     return tuple(str(path) for path in save(figure, output, PICTURE, pdf=False))
 
 

@@ -300,7 +300,7 @@ def _tell_sweep(step: float, threshold: Threshold[AnyOutcome]) -> None:
 def _tell_worst(
     pressed: Callable[[float], Outcome], planned: Callable[[], Outcome], workcell: Workcell
 ) -> None:
-    """Print whether the box holds with the worst friction of the uncertainty, with the commanded
+    """Print whether the box is held with the worst friction of the uncertainty, with the commanded
     and with the planned forces.
 
     Args:

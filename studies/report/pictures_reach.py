@@ -1,5 +1,5 @@
-"""Picture of the places at which both arms can hold the box at once: views from above, one for each
-height."""
+"""Picture of the positions at which both arms can hold the box at once: views from above, one for
+each height."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from scipy.spatial import ConvexHull
 
 from hybrid_opt.display.objects import ARM_COLOURS
 from hybrid_opt.display.solids import cell_solids, joint_placements
-from hybrid_opt.extras.proposing.hold_map import HeldPlace, HoldMap
+from hybrid_opt.extras.proposing.hold_map import HeldPose, HoldMap
 from hybrid_opt.extras.proposing.hold_search import PoseState
 from studies.report.drawing import (
     FULL_WIDTH,
@@ -42,7 +42,7 @@ BELOW_COLOUR = "#cfd4d8"
 """Colour of fixed bodies that end below the box."""
 
 COLLIDES_COLOUR, MEETS_COLOUR = "#f0b7a1", "#8c8c8c"
-"""Colours of places where arms collide, and where the box itself collides."""
+"""Colours of positions where arms collide, and where the box itself collides."""
 
 MOST_COLUMNS = 3
 """Largest number of panels side by side."""
@@ -51,7 +51,7 @@ MOST_SHADES = 4
 """Largest number of colours for the directions that hold."""
 
 OPACITY = 0.8
-"""Opacity of the places over the scene."""
+"""Opacity of the positions over the scene."""
 
 BASE_ROOM = 0.25
 """Distance of a base from the border of a panel [m]."""
@@ -65,7 +65,7 @@ Classes = tuple[tuple[str, int, int], ...]
 """For each colour, as '#rrggbb', the least and the largest number of directions that it shows."""
 
 
-def holdable_places(found: HoldMap) -> Figure:
+def holdable_positions(found: HoldMap) -> Figure:
     """Draw a map of the box positions that both arms can hold: one panel for each height, seen from
     above, with the number of directions of the box in which they hold it as colour. The best pose
     is drawn with the box and both arms.
@@ -91,11 +91,11 @@ def holdable_places(found: HoldMap) -> Figure:
         middle = np.mean([robot.T_world_base[:3, 3] for robot in robots], axis=0)
         for robot, colour in zip(robots, ARM_COLOURS, strict=True):
             _draw_base(axes, robot, colour, middle)
-        _draw_places(axes, found, level, classes)
+        _draw_positions(axes, found, level, classes)
         best = found.best(level)
         if best is not None:
             chosen = everywhere is not None and np.array_equal(best.pose, everywhere.pose)
-            _draw_place(axes, geometry, best, chosen)
+            _draw_held(axes, geometry, best, chosen)
         share = int((found.directions[level] > 0).sum())
         told = f"{share} places" if share else "nowhere"
         panel_label(axes, letter, f"z = {found.z[level]:.2f} m: {told}", bare=True)
@@ -196,7 +196,7 @@ def _draw_base(axes: Axes, robot: Robot, colour: str, middle: Array) -> None:
     )
 
 
-def _draw_places(axes: Axes, found: HoldMap, level: int, classes: Classes) -> None:
+def _draw_positions(axes: Axes, found: HoldMap, level: int, classes: Classes) -> None:
     """Fill the grid squares of the box positions at one height.
 
     Args:
@@ -218,7 +218,7 @@ def _draw_places(axes: Axes, found: HoldMap, level: int, classes: Classes) -> No
 def _fill(
     axes: Axes,
     found: HoldMap,
-    places: NDArray[np.bool_],
+    filled: NDArray[np.bool_],
     colour: str,
     hatch: str = "",
     edge: str = "none",
@@ -228,13 +228,13 @@ def _fill(
     Args:
         axes: the panel.
         found: the map.
-        places: (ny, nx) True for the positions to fill.
+        filled: (ny, nx) True for the positions to fill.
         colour, hatch, edge: how Matplotlib draws a square.
     """
     step = found.step or 0.1
     squares = [
         Rectangle((float(found.x[k] - step / 2.0), float(found.y[j] - step / 2.0)), step, step)
-        for j, k in np.argwhere(places)
+        for j, k in np.argwhere(filled)
     ]
     drawn = PatchCollection(
         squares, facecolor=colour, edgecolor=edge, hatch=hatch, alpha=OPACITY, zorder=3.0
@@ -243,23 +243,23 @@ def _fill(
     axes.add_collection(drawn, autolim=False)
 
 
-def _draw_place(axes: Axes, geometry: CellGeometry, place: HeldPlace, chosen: bool) -> None:
+def _draw_held(axes: Axes, geometry: CellGeometry, hold: HeldPose, chosen: bool) -> None:
     """Draw the outline of the box at a pose, and both arms from joint to joint.
 
     Args:
         axes: the panel.
         geometry: bodies of the cell.
-        place: pose of the box and posture of the arms.
+        hold: pose of the box and posture of the arms.
         chosen: True for the best pose of all heights.
     """
-    T_world_box = box_placement(geometry.workcell.task.orientation, place.pose)
+    T_world_box = box_placement(geometry.workcell.task.orientation, hold.pose)
     corners = np.concatenate(
         [solid.vertices for solid in cell_solids(geometry) if solid.frame.kind == "box"]
     )
     placed = corners @ T_world_box[:3, :3].T + T_world_box[:3, 3]
     axes.add_patch(_outline(placed, fill=False, linewidth=1.2, zorder=6.0))
     contacts = geometry.workcell.contacts
-    parts = zip(geometry.arms, contacts, place.q, ARM_COLOURS, strict=True)
+    parts = zip(geometry.arms, contacts, hold.q, ARM_COLOURS, strict=True)
     for arm, contact, q, colour in parts:
         placed = joint_placements(arm, q[None])[0]
         held = placed[-1] @ (arm.T_joint_box @ contact.T_box_pad)
@@ -268,7 +268,7 @@ def _draw_place(axes: Axes, geometry: CellGeometry, place: HeldPlace, chosen: bo
         axes.plot(line[:, 0], line[:, 1], "-", color=colour, linewidth=1.6, zorder=5.0)
         axes.plot(*line[-1], "o", color=colour, markersize=3.5, zorder=6.5)
     star: dict[str, Any] = {"markersize": 9.0 if chosen else 4.0, "zorder": 7.0, "color": "black"}
-    axes.plot(*FROM_ABOVE.flat(place.pose[:3]), "*" if chosen else ".", **star)
+    axes.plot(*FROM_ABOVE.flat(hold.pose[:3]), "*" if chosen else ".", **star)
 
 
 def _handles(found: HoldMap, classes: Classes) -> list[Patch | Line2D]:

@@ -29,7 +29,7 @@ from hybrid_opt.extras.calibrating.estimate import without_crosstalk
 from hybrid_opt.extras.calibrating.recording import (
     ArmLog,
     Labels,
-    Places,
+    PadMotion,
     Recording,
     lost_spans,
     tared,
@@ -103,13 +103,13 @@ class LoggedCarry:
 
     Attributes:
         run: the recording with its labels; joint positions and moments are missing.
-        places: poses of the pads, with x along the face, y up at the start and z into the box;
+        motion: poses of the pads, with x along the face, y up at the start and z into the box;
             poses of the box by its markers; force readings without offset and crosstalk.
         stated: True if the log states the mass of the box.
     """
 
     run: Recording
-    places: Places
+    motion: PadMotion
     stated: bool
 
     @property
@@ -163,9 +163,9 @@ def read(path: Path) -> LoggedCarry:
         pads[:, i, :3, :3] = poses[i][:, :3, :3] @ turned
         wrench[:, i, :3] = np.einsum("nji,nj->ni", pads[:, i, :3, :3], run.wrench[:, i, :3])
     wrench = median_filter(wrench, (GLITCH, 1, 1))
-    places, _ = tared(run, Places(pads, box, wrench))
-    free = without_crosstalk(places.wrench, np.array([[0.0, CROSSTALK]] * 2))
-    return LoggedCarry(run, Places(pads, box, free), mass is not None)
+    motion, _ = tared(run, PadMotion(pads, box, wrench))
+    free = without_crosstalk(motion.wrench, np.array([[0.0, CROSSTALK]] * 2))
+    return LoggedCarry(run, PadMotion(pads, box, free), mass is not None)
 
 
 class _Poses:
@@ -298,13 +298,13 @@ class Comparison:
 
 def compared(carry: LoggedCarry) -> Comparison:
     """Compare the measured forces of a logged carry with the forces of the model."""
-    run, places = carry.run, carry.places
+    run, motion = carry.run, carry.motion
     time = np.arange(run.time[0], run.time[-1], STEP)
     near = np.searchsorted(run.time, time).clip(0, len(run.time) - 1)
 
-    points = interpolated(time, run.time, places.pads[:, :, :3, 3]).swapaxes(0, 1)
+    points = interpolated(time, run.time, motion.pads[:, :, :3, 3]).swapaxes(0, 1)
     middle = (points[0] + points[1]) / 2.0
-    turned = Rotation.from_matrix(places.pads[near, 0, :3, :3])
+    turned = Rotation.from_matrix(motion.pads[near, 0, :3, :3])
     width = round(SMOOTHED / STEP) | 1
     speed = np.zeros_like(middle)
     speed[1:] = (turned[1:] * turned[:-1].inv()).as_rotvec() / STEP
@@ -319,12 +319,12 @@ def compared(carry: LoggedCarry) -> Comparison:
         np.asarray(_need()(force.T, moment.T, half[None], friction)).ravel()
         for friction in STATED_FRICTION
     ]
-    wrench = interpolated(time, run.time, places.wrench[:, :, :3])
+    wrench = interpolated(time, run.time, motion.wrench[:, :, :3])
     squeeze = -wrench[:, :, 2].mean(axis=1)
     tangential = np.linalg.norm(wrench[:, :, :2], axis=2).mean(axis=1)
     used = median_filter(tangential / np.maximum(squeeze, 1e-3), round(BRIEF / STEP))
-    lean, seen = _by_markers(places)
-    height = np.interp(time, run.time[seen], places.box[seen, 2, 3])
+    lean, seen = _by_markers(motion)
+    height = np.interp(time, run.time[seen], motion.box[seen, 2, 3])
     below = median_filter(height - middle[:, 2], 2 * width)
     lean = median_filter(np.interp(time, run.time[seen], lean[seen]), 2 * width)
     gripped = (time > 2.0 * TARE) & (time < 5.0 * TARE)
@@ -343,7 +343,7 @@ def compared(carry: LoggedCarry) -> Comparison:
     )
 
 
-def _by_markers(places: Places) -> tuple[Array, Array]:
+def _by_markers(motion: PadMotion) -> tuple[Array, Array]:
     """Compute how far a box has tilted, and at which samples its markers are valid.
 
     They are valid while the box tilts little and stays between the pads.
@@ -351,10 +351,10 @@ def _by_markers(places: Places) -> tuple[Array, Array]:
     Returns:
         (n,) angle of the box's upright axis from its start [rad], and (n,) booleans.
     """
-    start = Rotation.from_matrix(places.box[: 2 * GLITCH, :3, :3]).mean()
-    up = (Rotation.from_matrix(places.box[:, :3, :3]) * start.inv()).as_matrix()[:, 2, 2]
+    start = Rotation.from_matrix(motion.box[: 2 * GLITCH, :3, :3]).mean()
+    up = (Rotation.from_matrix(motion.box[:, :3, :3]) * start.inv()).as_matrix()[:, 2, 2]
     lean = np.arccos(np.clip(up, -1.0, 1.0))
-    beside = (places.box[:, :2, 3] - places.pads[:, :, :2, 3].mean(axis=1)).T
+    beside = (motion.box[:, :2, 3] - motion.pads[:, :, :2, 3].mean(axis=1)).T
     moved = np.hypot(*(beside - beside[:, : 2 * GLITCH].mean(axis=1, keepdims=True)))
     return lean, (lean < TIPPED) & (moved < BESIDE)
 

@@ -73,7 +73,7 @@ def mjcf_as_urdf(path: Path, content: bytes) -> bytes:
     The world is the root link `world`. MJCF has no velocity limits; they are written as zero, and a
     cell has to state them (`velocity_max`). Shapes that collide with nothing (contype and
     conaffinity zero) are left out; planes become slabs. A floating base, or a loose object of a
-    scene, is fixed at its place in the file.
+    scene, is fixed at its pose in the file.
 
     Args:
         path: the file.

@@ -27,7 +27,7 @@ from hybrid_opt.extras.calibrating.faults import (
     recording_faults,
     vanished,
 )
-from hybrid_opt.extras.calibrating.recording import Places, Recording, places_of, tared
+from hybrid_opt.extras.calibrating.recording import PadMotion, Recording, pad_motion, tared
 from hybrid_opt.extras.proposing.problem import Problem
 from symbolic import safe_io
 from symbolic.array import Array
@@ -173,12 +173,12 @@ def calibrate(workcell: Workcell, runs: Sequence[Recording]) -> Evidence:
     evidence = Evidence(workcell, tuple(run.name for run in runs))
     sound = []
     for run in runs:
-        places, offsets = tared(run, places_of(workcell, run))
-        faults = recording_faults(workcell, run, places)
+        motion, offsets = tared(run, pad_motion(workcell, run))
+        faults = recording_faults(workcell, run, motion)
         evidence.faults += faults
         if not any(fault.serious for fault in faults):
             _tell_offsets(run, offsets, evidence)
-            sound.append((run, places))
+            sound.append((run, motion))
     load = _load(sound, evidence)
     if not any(fault.serious and not fault.run for fault in evidence.faults):
         _friction(sound, load, evidence)
@@ -198,13 +198,13 @@ def _tell_offsets(run: Recording, offsets: Array, evidence: Evidence) -> None:
         evidence.tell(f"{run.name}, offset of arm {i + 1}", f"{told} N{drift}")
 
 
-def _pieces(run: Recording, places: Places) -> list[MeasuredHold]:
+def _pieces(run: Recording, motion: PadMotion) -> list[MeasuredHold]:
     """Cut the labelled holds of a run into pieces in which the box is still and no sample is
     missing.
 
     Args:
         run: the run.
-        places: pad poses and wrenches of the run.
+        motion: pad poses and wrenches of the run.
 
     Returns:
         Mean measurement of each piece.
@@ -213,7 +213,7 @@ def _pieces(run: Recording, places: Places) -> list[MeasuredHold]:
     for begin, end in run.labels.held:
         if any(a < end and b > begin for a, b in run.lost):
             continue
-        if not run.labels.empty and vanished(places.normal[run.within(begin, end)]).any():
+        if not run.labels.empty and vanished(motion.normal[run.within(begin, end)]).any():
             continue
         count = max(1, round((end - begin) / PIECE))
         edges = np.linspace(begin, end, count + 1)
@@ -224,9 +224,9 @@ def _pieces(run: Recording, places: Places) -> list[MeasuredHold]:
             if max(np.ptp(q[inside], axis=0).max() for q in run.joints) > STILL_MOTION:
                 continue
             middle = np.flatnonzero(inside)[np.count_nonzero(inside) // 2]
-            T_world_box = places.box[middle]
-            pads = np.array([inverse(T_world_box) @ pad for pad in places.pads[middle]])
-            wrench = np.nan_to_num(places.wrench[inside].mean(axis=0))
+            T_world_box = motion.box[middle]
+            pads = np.array([inverse(T_world_box) @ pad for pad in motion.pads[middle]])
+            wrench = np.nan_to_num(motion.wrench[inside].mean(axis=0))
             gravity = T_world_box[:3, :3].T @ GRAVITY
             found.append(MeasuredHold(pads, gravity, wrench, run.labels.mass))
     return found
@@ -252,7 +252,7 @@ def _empty(run: Recording, pieces: list[MeasuredHold], evidence: Evidence) -> No
         evidence.faults.append(Fault(run.name, "residual", text, serious=False))
 
 
-Sound = list[tuple[Recording, Places]]
+Sound = list[tuple[Recording, PadMotion]]
 """Runs without serious faults, each with its pad poses and its wrenches without offsets."""
 
 
@@ -268,8 +268,8 @@ def _load(sound: Sound, evidence: Evidence) -> Load | None:
         The estimate; None if there are no holds, or the holds have faults.
     """
     holds, moments = [], True
-    for run, places in sound:
-        found = _pieces(run, places)
+    for run, motion in sound:
+        found = _pieces(run, motion)
         if run.labels.empty:
             _empty(run, found, evidence)
             continue
@@ -351,10 +351,10 @@ def _friction(sound: Sound, load: Load | None, evidence: Evidence) -> None:
     ratio_of = FrictionRatio(evidence.workcell)
     held: list[tuple[float, str]] = []
     slipped: list[tuple[float, str]] = []
-    for run, places in sound:
+    for run, motion in sound:
         if run.labels.empty or not run.has_moments:
             continue
-        wrench = without_crosstalk(places.wrench, load.crosstalk)
+        wrench = without_crosstalk(motion.wrench, load.crosstalk)
 
         def ratio(begin: float, run: Recording = run, wrench: Array = wrench) -> float:
             inside = run.within(begin, begin + RATIO_TIME)
@@ -397,8 +397,8 @@ def _tracking(sound: Sound, evidence: Evidence) -> None:
     worst: list[float] = []
     for i in range(2):
         shares, lags = [], []
-        for run, places in sound:
-            commanded, normal = run.commanded[:, i], places.normal[:, i]
+        for run, motion in sound:
+            commanded, normal = run.commanded[:, i], motion.normal[:, i]
             known = np.isfinite(commanded)
             if not known.any():
                 continue
@@ -430,18 +430,18 @@ def _drift(sound: Sound, evidence: Evidence) -> None:
     beside: list[Array] = []
     turned: list[Array] = []
     delays = []
-    for run, places in sound:
+    for run, motion in sound:
         for begin, end in run.labels.held:
             inside = run.within(begin, end)
             if run.labels.empty or np.count_nonzero(inside) < 5:
                 continue
-            between = np.linalg.inv(places.pads[inside, 0]) @ places.pads[inside, 1]
+            between = np.linalg.inv(motion.pads[inside, 0]) @ motion.pads[inside, 1]
             change = between[0, :3, :3].T @ between[:, :3, :3]
             cosine = (np.trace(change, axis1=1, axis2=2) - 1.0) / 2.0
             turned.append(np.arccos(np.clip(cosine, -1.0, 1.0)))
             beside.append(np.linalg.norm(between[:, :2, 3] - between[0, :2, 3], axis=1))
         path = [
-            places.pads[:, i, :3, :] @ inverse(evidence.workcell.contacts[i].T_box_pad)[:, 3]
+            motion.pads[:, i, :3, :] @ inverse(evidence.workcell.contacts[i].T_box_pad)[:, 3]
             for i in range(2)
         ]
         axis = int(np.argmax(np.ptp(path[0], axis=0)))

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hybrid_opt.extras.calibrating.estimate import Load, MeasuredHold, delay, fit_load
-from hybrid_opt.extras.calibrating.recording import TARE_TIME, Places, Recording, places_of
+from hybrid_opt.extras.calibrating.recording import TARE_TIME, PadMotion, Recording, pad_motion
 from symbolic.array import Array
 from symbolic.records import Workcell
 from symbolic.records.poses import inverse
@@ -76,13 +76,13 @@ class Fault:
         return f"{where}{self.name}: {self.text}"
 
 
-def recording_faults(workcell: Workcell, run: Recording, places: Places) -> list[Fault]:
+def recording_faults(workcell: Workcell, run: Recording, motion: PadMotion) -> list[Fault]:
     """Return the faults of a single run; empty for none.
 
     Args:
         workcell: the cell.
         run: the run.
-        places: pad poses and wrenches of the run, without the sensors' offsets.
+        motion: pad poses and wrenches of the run, without the sensors' offsets.
     """
     found = [*_dropouts(run), *_range_faults(run)]
     if not run.has_moments:
@@ -90,15 +90,15 @@ def recording_faults(workcell: Workcell, run: Recording, places: Places) -> list
         found.append(Fault(run.name, "moments missing", text, serious=False))
     # One kind of fault is reported at a time: what follows from it would mislead.
     return found + (
-        _unit_faults(workcell, run, places)
-        or _tare_faults(run, places)
-        or _frame_faults(run, places)
-        or _clock_faults(run, places)
-        or _pad_faults(workcell, run, places)
+        _unit_faults(workcell, run, motion)
+        or _tare_faults(run, motion)
+        or _frame_faults(run, motion)
+        or _clock_faults(run, motion)
+        or _pad_faults(workcell, run, motion)
     )
 
 
-def _tare_faults(run: Recording, places: Places) -> list[Fault]:
+def _tare_faults(run: Recording, motion: PadMotion) -> list[Fault]:
     """Check the labelled tares of a run: instants at which the arms touch nothing and the sensors'
     offsets are measured.
 
@@ -106,7 +106,7 @@ def _tare_faults(run: Recording, places: Places) -> list[Fault]:
 
     Args:
         run: the run.
-        places: pad poses and wrenches of the run.
+        motion: pad poses and wrenches of the run.
 
     Returns:
         The faults; an empty list for none.
@@ -135,7 +135,7 @@ def _tare_faults(run: Recording, places: Places) -> list[Fault]:
     free = np.cumsum(held) * np.cumsum(held[::-1])[::-1] == 0
     if not found and held.any() and free.any() and not run.labels.empty:
         wide = max(1, round(TARE_TIME / run.steps.max()))
-        smooth = np.apply_along_axis(np.convolve, 0, places.normal, np.ones(wide) / wide, "same")
+        smooth = np.apply_along_axis(np.convolve, 0, motion.normal, np.ones(wide) / wide, "same")
         least, pressed = smooth[free].min(axis=0), smooth[held].min(axis=0)
         pull = np.maximum(LEAST_PULL, SHARE_PULL * np.ptp(smooth, axis=0))
         if (least < np.minimum(pressed, 0.0) - pull).any():
@@ -146,12 +146,12 @@ def _tare_faults(run: Recording, places: Places) -> list[Fault]:
     return [Fault(run.name, "missing tare", text) for text in found]
 
 
-def _frame_faults(run: Recording, places: Places) -> list[Fault]:
+def _frame_faults(run: Recording, motion: PadMotion) -> list[Fault]:
     held = _held(run)
     if not held.any() or run.labels.empty:
         return []
-    normal = np.median(places.normal[held], axis=0)
-    force = np.median(np.linalg.norm(places.wrench[held, :, :3], axis=2), axis=0)
+    normal = np.median(motion.normal[held], axis=0)
+    force = np.median(np.linalg.norm(motion.wrench[held, :, :3], axis=2), axis=0)
     if (normal >= LEAST_NORMAL * force).all():
         return []
     told = ", ".join(f"{n:.0f} of {f:.0f} N" for n, f in zip(normal, force, strict=True))
@@ -171,7 +171,7 @@ def _held(run: Recording) -> Array:
     return found
 
 
-def _unit_faults(workcell: Workcell, run: Recording, places: Places) -> list[Fault]:
+def _unit_faults(workcell: Workcell, run: Recording, motion: PadMotion) -> list[Fault]:
     found = []
     if run.steps.max() > LONGEST_STEP:
         found.append(f"a sample every {run.steps.max():g} s; times look like ms")
@@ -181,20 +181,20 @@ def _unit_faults(workcell: Workcell, run: Recording, places: Places) -> list[Fau
             found.append(f"{robot.name!r} is far beyond its joint limits; they look like degrees")
     held = _held(run)
     if not found and held.any() and not run.labels.empty:
-        found = _force_units(run, places, held) or _moment_units(workcell, places, held)
+        found = _force_units(run, motion, held) or _moment_units(workcell, motion, held)
     return [Fault(run.name, "unit error", text) for text in found]
 
 
-def _force_units(run: Recording, places: Places, held: Array) -> list[str]:
+def _force_units(run: Recording, motion: PadMotion, held: Array) -> list[str]:
     """Return texts about forces that seem to be in another unit, compared with the commanded forces
     or with the forces of the other arm.
 
     Args:
         run: the run.
-        places: pad poses and wrenches of the run.
+        motion: pad poses and wrenches of the run.
         held: (n,) True for samples within a labelled hold.
     """
-    force = np.median(np.linalg.norm(places.wrench[held, :, :3], axis=2), axis=0)
+    force = np.median(np.linalg.norm(motion.wrench[held, :, :3], axis=2), axis=0)
     commands = np.isfinite(run.commanded).any(axis=0)
     asked = np.nanmedian(np.where(commands, run.commanded[held], 0.0), axis=0)
     for unit, factor in FORCE_UNITS:
@@ -213,18 +213,18 @@ def _force_units(run: Recording, places: Places, held: Array) -> list[str]:
     return []
 
 
-def _moment_units(workcell: Workcell, places: Places, held: Array) -> list[str]:
+def _moment_units(workcell: Workcell, motion: PadMotion, held: Array) -> list[str]:
     """Return texts about moments that seem to be in another unit, compared with what the contact
     patches can transmit.
 
     Args:
         workcell: the cell.
-        places: pad poses and wrenches of the run.
+        motion: pad poses and wrenches of the run.
         held: (n,) True for samples within a labelled hold.
     """
-    normal = np.abs(np.median(places.normal[held], axis=0)).mean()
+    normal = np.abs(np.median(motion.normal[held], axis=0)).mean()
     for i, contact in enumerate(workcell.contacts):
-        moment = float(np.median(np.linalg.norm(places.wrench[held, i, 3:], axis=1)))
+        moment = float(np.median(np.linalg.norm(motion.wrench[held, i, 3:], axis=1)))
         if moment > LONGEST_LEVER * contact.patch_radius * normal:
             unit = "N mm" if moment > 2.0 * normal else "N cm"
             return [f"moments of arm {i + 1} are {moment:.3g}; they look like {unit}"]
@@ -266,14 +266,14 @@ def _range_faults(run: Recording) -> list[Fault]:
     return found
 
 
-def _pad_faults(workcell: Workcell, run: Recording, places: Places) -> list[Fault]:
+def _pad_faults(workcell: Workcell, run: Recording, motion: PadMotion) -> list[Fault]:
     """Return faults of pads that are not at their positions on the box during holds, and of normal
     forces that vanish; empty for none.
 
     Args:
         workcell: the cell.
         run: the run.
-        places: pad poses and wrenches of the run.
+        motion: pad poses and wrenches of the run.
     """
     found = []
     nominal = inverse(workcell.contacts[0].T_box_pad) @ workcell.contacts[1].T_box_pad
@@ -287,9 +287,9 @@ def _pad_faults(workcell: Workcell, run: Recording, places: Places) -> list[Faul
         inside = run.within(begin, end)
         if not inside.any() or run.labels.empty:
             continue
-        far = apart(places.pads[inside])
+        far = apart(motion.pads[inside])
         if far > room and run.joints[0].shape == run.joints[1].shape:
-            other = places_of(workcell, replace(run, joints=run.joints[::-1]))
+            other = pad_motion(workcell, replace(run, joints=run.joints[::-1]))
             if apart(other.pads[inside]) < room:
                 text = (
                     "with the joints exchanged the pads face one another; check which arm is which"
@@ -301,7 +301,7 @@ def _pad_faults(workcell: Workcell, run: Recording, places: Places) -> list[Faul
                 "check the joints' order, which arm is which, and the bases"
             )
             found.append(Fault(run.name, "pads do not overlap", text))
-        gone = vanished(places.normal[inside])
+        gone = vanished(motion.normal[inside])
         if gone.any():
             at = run.time[inside][int(np.argmax(gone))]
             text = f"at {at:.2f} s, in a hold from {begin:g} to {end:g} s, which is left out"
@@ -323,9 +323,9 @@ def vanished(normal: Array) -> Array:
     return np.asarray((squeeze < VANISHED * usual) & (usual > 0.0))
 
 
-def _clock_faults(run: Recording, places: Places) -> list[Fault]:
+def _clock_faults(run: Recording, motion: PadMotion) -> list[Fault]:
     late = delay(
-        run.time, places.normal[:, 0], places.normal[:, 1], LARGEST_DELAY, LARGEST_CLOCK_OFFSET
+        run.time, motion.normal[:, 0], motion.normal[:, 1], LARGEST_DELAY, LARGEST_CLOCK_OFFSET
     )
     if late is None or abs(late) <= LARGEST_CLOCK_OFFSET:
         return []

@@ -381,7 +381,7 @@ def _csv_columns(path: Path) -> dict[str, Array]:
 
 
 @dataclass(frozen=True)
-class Places:
+class PadMotion:
     """Poses of both pads in a run, and the wrenches on them.
 
     Attributes:
@@ -402,7 +402,7 @@ class Places:
         return -self.wrench[:, :, 2]
 
 
-def places_of(workcell: Workcell, run: Recording) -> Places:
+def pad_motion(workcell: Workcell, run: Recording) -> PadMotion:
     """Compute pad poses, box poses and wrenches about the pads from a recorded run.
 
     Args:
@@ -430,17 +430,17 @@ def places_of(workcell: Workcell, run: Recording) -> Places:
     # The nearest rotation to the mean of both.
     u, _, v = np.linalg.svd(middle[:, :3, :3])
     middle[:, :3, :3] = u @ v
-    return Places(np.stack(pads, axis=1), middle, np.stack(wrenches, axis=1))
+    return PadMotion(np.stack(pads, axis=1), middle, np.stack(wrenches, axis=1))
 
 
-def tared(run: Recording, places: Places) -> tuple[Places, Array]:
+def tared(run: Recording, motion: PadMotion) -> tuple[PadMotion, Array]:
     """Subtract the force sensors' offsets from the wrenches of a run.
 
     The offset of a sample is the one measured at the last tare before it.
 
     Args:
         run: the run, whose labels state the tares.
-        places: pad poses and wrenches of the run.
+        motion: pad poses and wrenches of the run.
 
     Returns:
         - The pad poses with corrected wrenches.
@@ -448,10 +448,10 @@ def tared(run: Recording, places: Places) -> tuple[Places, Array]:
     """
     instants = [instant for instant in sorted(run.labels.tare) if run.around(instant).any()]
     if not instants:
-        return places, np.empty((0, 2, 6))
-    offsets = np.array([places.wrench[run.around(instant)].mean(axis=0) for instant in instants])
+        return motion, np.empty((0, 2, 6))
+    offsets = np.array([motion.wrench[run.around(instant)].mean(axis=0) for instant in instants])
     before = np.maximum(np.searchsorted(instants, run.time, side="right") - 1, 0)
-    return replace(places, wrench=places.wrench - offsets[before]), offsets
+    return replace(motion, wrench=motion.wrench - offsets[before]), offsets
 
 
 ENDINGS = (".mcap", ".db3")

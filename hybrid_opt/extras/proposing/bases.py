@@ -1,4 +1,4 @@
-"""Possible bases of two robots: places beside the carry, ranked by how well the arms follow the
+"""Possible bases of two robots: poses beside the carry, ranked by how well the arms follow the
 carry from them, and by the number of detours around obstacles that both arms can follow.
 
 Heights of bases are those of the file, or zero: the user builds the stands of the robots.
@@ -49,7 +49,7 @@ REACH_MEAN_POSTURES = 500
 MOST_CHOICES = 6
 """Largest number of pairs of bases that are returned."""
 
-PLACE_STARTS = 192
+BASE_STARTS = 192
 """Number of random postures from which a base is evaluated."""
 
 EVERY_SPIN = 2
@@ -119,22 +119,22 @@ def _scored(
         state the bases: new keys and values by name of the table.
     """
     draft = draft_of(problem)
-    scorer = PlaceScorer(problem, draft, spins, rng)
+    scorer = BaseScorer(problem, draft, spins, rng)
     if problem.is_machine:
         found = []
-        for base in machine_places(problem, draft):
-            first = scorer.place(0, base)
-            second = None if first is None else scorer.place(1, base)
+        for base in machine_bases(problem, draft):
+            first = scorer.rank(0, base)
+            second = None if first is None else scorer.rank(1, base)
             if first is not None and second is not None:
                 value = min(first.value, second.value) + shared_room(first, second)
                 found.append((value, _standing(problem, [base] * 2)))
         return found
     best: list[list[RankedBase]] = []
     for arm in (0, 1):
-        tried = [scorer.place(arm, base) for base in _places(problem, draft, arm)]
-        places = [place for place in tried if place is not None]
-        places.sort(key=lambda place: -place.value)
-        best.append(places[:3])
+        tried = [scorer.rank(arm, base) for base in _tried_bases(problem, draft, arm)]
+        ranked = [each for each in tried if each is not None]
+        ranked.sort(key=lambda each: -each.value)
+        best.append(ranked[:3])
     return [
         (
             first.value + second.value + shared_room(first, second),
@@ -205,7 +205,7 @@ def _base(problem: Problem, arm: int, point: Array, outwards: Array) -> Array:
     return np.array([point[0], point[1], float(given[2]), 0.0, 0.0, yaw])
 
 
-def _places(problem: Problem, draft: Workcell, arm: int) -> list[Array]:
+def _tried_bases(problem: Problem, draft: Workcell, arm: int) -> list[Array]:
     middle, outwards = _sideways(problem, arm)
     _, length = stretched_length(draft.robots[arm])
     along = np.cross(outwards, [0.0, 0.0, 1.0])
@@ -215,7 +215,7 @@ def _places(problem: Problem, draft: Workcell, arm: int) -> list[Array]:
     ]
 
 
-def machine_places(problem: Problem, draft: Workcell) -> list[Array]:
+def machine_bases(problem: Problem, draft: Workcell) -> list[Array]:
     """Propose base poses (6,) [m, rad] of a machine with two arms, from which the arms reach the
     carry.
 
@@ -259,7 +259,7 @@ def _mean_reach(draft: Workcell, at: list[Array]) -> Array:
     rng, reaches = np.random.default_rng(0), []
     for arm in (0, 1):
         kinematics = ArmKinematics(draft, arm)
-        T, _ = kinematics.places(kinematics.drawn(REACH_MEAN_POSTURES, rng))
+        T, _ = kinematics.pose_and_jacobian(kinematics.drawn(REACH_MEAN_POSTURES, rng))
         own = inverse(draft.robots[arm].T_world_base)
         reaches.append((own @ T.mean(axis=0)[:, 3])[:3] - at[arm])
     return np.asarray((reaches[0] + reaches[1]) / 2.0)
@@ -272,7 +272,7 @@ class RankedBase:
     Attributes:
         base: (6,) pose of the base in the world [m, rad].
         value: score; larger is better.
-        follows: (k,) True for each of the k box paths of `PlaceScorer` along which the arm can hold
+        follows: (k,) True for each of the k box paths of `BaseScorer` along which the arm can hold
             the box.
     """
 
@@ -281,7 +281,7 @@ class RankedBase:
     follows: NDArray[np.bool_]
 
 
-class PlaceScorer:
+class BaseScorer:
     """Evaluator of base poses of robots, for given contacts."""
 
     def __init__(
@@ -302,14 +302,14 @@ class PlaceScorer:
         at = zip(own, shoulder_positions(draft.robots), strict=True)
         self._shoulders = [(T @ np.append(point, 1.0))[:3] for T, point in at]
         self._arms = [ArmKinematics(draft, arm) for arm in (0, 1)]
-        self._query = HoldQuery(start, goal, spins[::EVERY_SPIN], None, PLACE_STARTS, GUIDES_TRIED)
+        self._query = HoldQuery(start, goal, spins[::EVERY_SPIN], None, BASE_STARTS, GUIDES_TRIED)
         meshes = MeshReader()
         self._environment = [
             shape_pieces(body.shape, body.pose, body.name, meshes) for body in draft.environment
         ]
         self._feet = [_feet(draft, arm) for arm in (0, 1)]
 
-    def place(self, arm: int, base: Array) -> RankedBase | None:
+    def rank(self, arm: int, base: Array) -> RankedBase | None:
         """Evaluate a base of an arm. Return None if the robot collides there, or if the arm cannot
         hold the box from start to goal.
 
@@ -468,5 +468,5 @@ def _detour(start: Array, goal: Array, aside: Array) -> Array:
     length = np.linalg.norm(np.diff(points[:, :3], axis=0), axis=1)
     length[2] = max(length[2], 1e-3)  # a turn on the spot takes place there
     along = np.concatenate([[0.0], np.cumsum(np.maximum(length, 1e-9))])
-    places = np.linspace(0.0, along[-1], POSES)
-    return np.column_stack([np.interp(places, along, points[:, k]) for k in range(6)])
+    at = np.linspace(0.0, along[-1], POSES)
+    return np.column_stack([np.interp(at, along, points[:, k]) for k in range(6)])

@@ -283,9 +283,11 @@ class ClosedChain:
         begins = np.abs(whole[0] - np.concatenate(first.q)).max() < MATCH
         if not (closed.all() and joined and begins and arrives):
             return None
-        places = [ChainConfiguration(each, (q[0][k], q[1][k])) for k, each in enumerate(path)]
-        free = self._free(places[1:-1]) == len(places) - 2
-        return [first, *places[1:-1], last] if free else None
+        configurations = [
+            ChainConfiguration(each, (q[0][k], q[1][k])) for k, each in enumerate(path)
+        ]
+        free = self._free(configurations[1:-1]) == len(configurations) - 2
+        return [first, *configurations[1:-1], last] if free else None
 
     def reach(self, begin: ChainConfiguration, extended: Array) -> ChainConfiguration | None:
         """Return the configuration at the end of a straight motion; None if the motion is not free
@@ -310,18 +312,18 @@ class ClosedChain:
         found = [begin, *self.along(begin, path[1:])]
         return found if len(found) == len(path) else None
 
-    def _free(self, places: list[ChainConfiguration]) -> int:
+    def _free(self, path: list[ChainConfiguration]) -> int:
         """Count the configurations before the first one that collides; all if none does.
 
         Args:
-            places: configurations along a path.
+            path: the configurations.
         """
-        if not places:
+        if not path:
             return 0
-        pose = np.array([place.extended[:POSE_SIZE] for place in places])
-        q_1, q_2 = (np.array([place.q[arm] for place in places]) for arm in (0, 1))
+        pose = np.array([each.extended[:POSE_SIZE] for each in path])
+        q_1, q_2 = (np.array([each.q[arm] for each in path]) for arm in (0, 1))
         hit = self.blocked(pose, (q_1, q_2))
-        return int(np.argmax(hit)) if hit.any() else len(places)
+        return int(np.argmax(hit)) if hit.any() else len(path)
 
     def blocked(self, pose: Array, q: tuple[Array, Array]) -> NDArray[np.bool_]:
         """Find configurations that collide, or in which holding the box at rest takes too much of a

@@ -161,7 +161,7 @@ class MachineKinematics:
         J, error = np.zeros((n, 12, len(self.rest))), np.empty((n, 12))
         residual, determinant = np.zeros(n), np.empty((2, n))
         for k, arm in enumerate(self.arms):
-            T, own = arm.places(self.joints(x, k))
+            T, own = arm.pose_and_jacobian(self.joints(x, k))
             rows = slice(6 * k, 6 * k + 6)
             J[:, rows, : self.common] = own[:, :, arm.common]
             J[:, rows, self._entries[k]] = own[:, :, self._own[k]]

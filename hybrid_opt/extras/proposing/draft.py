@@ -15,7 +15,7 @@ from hybrid_opt.extras.proposing.decimals import (
     readable_turns,
     rounded_outwards,
 )
-from hybrid_opt.extras.proposing.hand_places import place_entry
+from hybrid_opt.extras.proposing.hand_positions import contact_entry
 from hybrid_opt.extras.proposing.kinematics import rotate_about_normal
 from hybrid_opt.extras.proposing.problem import DRAFT_ROOM, Problem
 from symbolic.array import Array
@@ -115,7 +115,7 @@ def changes(problem: Problem, found: Draft) -> dict[str, Any]:
         contact = found.workcell.contacts[i]
         if contact.further and found.spins[i]:
             with_normals = "normal" in problem.data["contacts"][i]
-            entry = place_entry(rotate_about_normal(contact, found.spins[i]), with_normals)
+            entry = contact_entry(rotate_about_normal(contact, found.spins[i]), with_normals)
         else:
             spin = entry.get("spin", problem.data["contacts"][i].get("spin", 0.0)) + found.spins[i]
             turn = float(np.remainder(spin + np.pi, 2 * np.pi) - np.pi)

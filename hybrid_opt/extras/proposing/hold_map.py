@@ -1,4 +1,4 @@
-"""Where both arms can hold the box at once: a map over places and directions of the box, before
+"""Where both arms can hold the box at once: a map over positions and directions of the box, before
 anybody chooses poses."""
 
 from __future__ import annotations
@@ -37,13 +37,13 @@ LEVEL_STEP = 0.05
 """Unit of chosen heights [m]."""
 
 COARSE_GRID = (10, 10, 18)
-"""Numbers of places along x, y and z of the first, coarse grid."""
+"""Numbers of positions along x, y and z of the first, coarse grid."""
 
-PLACE_STEPS = (0.02, 0.05, 0.1, 0.2)
-"""Distances between places of which one is chosen if none is given [m]: the least with at most
-`USUAL_PLACES` places on a level."""
+POSITION_STEPS = (0.02, 0.05, 0.1, 0.2)
+"""Distances between positions of which one is chosen if none is given [m]: the least with at most
+`USUAL_POSITIONS` positions at one height."""
 
-USUAL_PLACES = 1000
+USUAL_POSITIONS = 1000
 
 MOST_POSES = 100_000
 """Largest number of box poses of a map."""
@@ -58,7 +58,7 @@ class HoldMapSettings:
     """Grid of a map of box poses that both arms can hold.
 
     Attributes:
-        step: distance between positions at one height [m]; None to choose one of `PLACE_STEPS`.
+        step: distance between positions at one height [m]; None to choose one of `POSITION_STEPS`.
         heights: heights of the box centre in the world [m]; empty to choose `CHOSEN_HEIGHTS` from
             the lowest to the highest at which both arms can hold the box.
         yaws: number of directions of the box, evenly over half a turn about the vertical; over a
@@ -80,7 +80,7 @@ class HoldMapSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class HeldPlace:
+class HeldPose:
     """A pose of the box with a posture of both arms that holds it.
 
     Attributes:
@@ -165,7 +165,7 @@ class HoldMap:
             depth[level, :, :, yaw] = ndimage.distance_transform_edt(inside[level, :, :, yaw])
         return np.asarray(depth[:, 1:-1, 1:-1] * np.where(self.holds, self.comfort + 1e-6, 0.0))
 
-    def best(self, level: int | None = None) -> HeldPlace | None:
+    def best(self, level: int | None = None) -> HeldPose | None:
         """Return the best box pose that both arms can hold; None if there is none.
 
         It maximises the comfort of the postures times the distance to the nearest position at which
@@ -176,12 +176,12 @@ class HoldMap:
         """
         first = 0 if level is None else level
         quality = self._quality if level is None else self._quality[level : level + 1]
-        place = np.unravel_index(int(np.argmax(quality)), quality.shape)
-        if not quality[place] > 0.0:
+        index = np.unravel_index(int(np.argmax(quality)), quality.shape)
+        if not quality[index] > 0.0:
             return None
-        at = (first + int(place[0]), *map(int, place[1:]))
+        at = (first + int(index[0]), *map(int, index[1:]))
         spins = self.spins[at]
-        return HeldPlace(
+        return HeldPose(
             self.poses[at],
             self.ways[int(self.way[at])],
             (float(spins[0]), float(spins[1])),
@@ -334,7 +334,7 @@ class _GridSearch:
             lows.append(np.max([at - radius for at, radius in spheres], axis=0))
             highs.append(np.min([at + radius for at, radius in spheres], axis=0))
         low, high = np.min(lows, axis=0), np.max(highs, axis=0)
-        # Where no place is within both lengths, one is as good as any.
+        # Where no position is within both lengths, one is as good as any.
         low, high = np.minimum(low, (low + high) / 2.0), np.maximum(high, (low + high) / 2.0)
         x, y, z = (np.linspace(a, b, n) for a, b, n in zip(low, high, COARSE_GRID, strict=True))
         return x, y, z
@@ -350,15 +350,15 @@ class _GridSearch:
         for other in (state == PoseState.COLLIDES, state >= PoseState.OUT_OF_REACH):
             wanted = wanted if wanted.any() else other
         ranges = []
-        for axis, places in zip((2, 1, 0), coarse, strict=True):
-            used = places[wanted.any(axis=tuple({0, 1, 2, 3} - {axis}))]
+        for axis, values in zip((2, 1, 0), coarse, strict=True):
+            used = values[wanted.any(axis=tuple({0, 1, 2, 3} - {axis}))]
             # Heights are few, so they stay near those that hold.
-            gap = (0.5 if axis == 0 else 1.0) * float(places[1] - places[0])
-            ranges.append((max(used[0] - gap, places[0]), min(used[-1] + gap, places[-1])))
+            gap = (0.5 if axis == 0 else 1.0) * float(values[1] - values[0])
+            ranges.append((max(used[0] - gap, values[0]), min(used[-1] + gap, values[-1])))
         settings = self._settings
-        steps = PLACE_STEPS if settings.step is None else (settings.step,)
+        steps = POSITION_STEPS if settings.step is None else (settings.step,)
         grids = [(_multiples(*ranges[0], step), _multiples(*ranges[1], step)) for step in steps]
-        x, y = next((g for g in grids if len(g[0]) * len(g[1]) <= USUAL_PLACES), grids[-1])
+        x, y = next((g for g in grids if len(g[0]) * len(g[1]) <= USUAL_POSITIONS), grids[-1])
         if settings.heights:
             return x, y, np.unique(settings.heights)
         z = _multiples(*ranges[2], LEVEL_STEP)

@@ -1,6 +1,6 @@
 """Search for postures of both arms that hold the box, at many box poses at once.
 
-Postures come from a library of random ones: those whose pads are nearest to the wanted place are
+Postures come from a library of random ones: those whose pads are nearest to the wanted pose are
 moved there by Newton's method.
 """
 
@@ -43,10 +43,10 @@ LIBRARY = 40_000
 """Number of random postures of each arm in its library."""
 
 NEAR_POSTURES = 8
-"""Number of postures of the library from which a pad's place is searched."""
+"""Number of postures of the library from which a pad's pose is searched."""
 
 FARTHEST = 0.25
-"""Largest distance of such a posture from the pad's place [m], with `NORMAL_LEVER`."""
+"""Largest distance of such a posture from the wanted pad pose [m], with `NORMAL_LEVER`."""
 
 NORMAL_LEVER = 0.3
 """Length that a unit of difference between pad normals counts in this distance [m]."""
@@ -168,7 +168,7 @@ def ways_to_hold(problem: Problem, spins: Array) -> Iterator[WayToHold]:
 
 
 class PostureLibrary:
-    """Random usable postures of one arm, to be found by the place of its pad."""
+    """Random usable postures of one arm, to be found by the pose of its pad."""
 
     def __init__(self, arm: ArmKinematics, q: Array) -> None:
         """Keep the postures within joint limits and away from singular ones.
@@ -177,7 +177,7 @@ class PostureLibrary:
             arm: the arm.
             q: (n, joints) postures [rad or m].
         """
-        T, jacobian = arm.places(q)
+        T, jacobian = arm.pose_and_jacobian(q)
         measure = np.abs(np.linalg.det(jacobian[:, :, arm.following]))
         fine = (measure >= arm.least) & _inside(arm, q)
         contact = arm.workcell.contacts[arm.arm]

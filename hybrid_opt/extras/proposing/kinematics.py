@@ -1,4 +1,4 @@
-"""Kinematics of one arm that holds the box. `newton.cpp` computes places, Jacobians and Newton
+"""Kinematics of one arm that holds the box. `newton.cpp` computes poses, Jacobians and Newton
 steps."""
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ class ArmKinematics:
         low, high = self.span
         return rng.uniform(low, high, (count, len(low)))
 
-    def places(self, q: Array) -> tuple[Array, Array]:
+    def pose_and_jacobian(self, q: Array) -> tuple[Array, Array]:
         """Compute pose and Jacobian of the arm's last joint.
 
         Args:
@@ -164,7 +164,9 @@ class ArmKinematics:
         Args:
             q: (joints,) posture [rad or m].
         """
-        return float(np.sign(np.linalg.det(self.places(q[None])[1][0][:, self.following])))
+        return float(
+            np.sign(np.linalg.det(self.pose_and_jacobian(q[None])[1][0][:, self.following]))
+        )
 
     def solve(self, q: Array, target: Array, steps: int, damping: float = 0.0) -> Postures:
         """Find postures that put the last joint at given poses, by Newton's method. Redundant

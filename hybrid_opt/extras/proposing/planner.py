@@ -172,11 +172,11 @@ def retreats(chain: ClosedChain, ends: tuple[ChainConfiguration, ChainConfigurat
         end itself to the last one before a collision.
     """
     ways = DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1)[:, None]
-    begins = [place for place in ends for _ in ways]
-    away = np.array([place.extended for place in begins])
+    begins = [each for each in ends for _ in ways]
+    away = np.array([each.extended for each in begins])
     away[:, :3] += RETREAT * np.tile(ways, (len(ends), 1))
     steps = round(RETREAT / PATH_STEP)
-    paths = np.linspace([place.extended for place in begins], away, steps + 1, axis=1)
+    paths = np.linspace([each.extended for each in begins], away, steps + 1, axis=1)
     found = chain.along_many(begins, paths)
     return found[: len(ways)], found[len(ways) :]
 
@@ -249,14 +249,14 @@ def plan(
     Raises:
         SettingsError: OMPL is not installed.
     """
-    places: dict[State, ChainConfiguration] = {}
+    known: dict[State, ChainConfiguration] = {}
     ways: dict[State, ChainConfiguration] = {}
     ends: tuple[list[State], list[State]] = ([], [])
     for states, ways_out in zip(ends, out, strict=True):
-        place = ways_out[0][0]
-        for stop in (place, *_usable([way[-1] for way in ways_out], place, room)):
+        end = ways_out[0][0]
+        for stop in (end, *_usable([way[-1] for way in ways_out], end, room)):
             state: State = tuple(room.coordinates(stop.extended).tolist())
-            places[state], ways[state] = stop, place
+            known[state], ways[state] = stop, end
             states.append(state)
 
     def joined(first: State, second: State) -> bool:
@@ -269,12 +269,12 @@ def plan(
             first: (d,) coordinate in `room`.
             second: (d,) another coordinate.
         """
-        if first not in places:
+        if first not in known:
             first, second = second, first
-        if first not in places:
+        if first not in known:
             return False
-        found = chain.reach(places[first], room.extended(np.array(second)))
-        return found is not None and same(places.setdefault(second, found), found)
+        found = chain.reach(known[first], room.extended(np.array(second)))
+        return found is not None and same(known.setdefault(second, found), found)
 
     last = chain.looked + most
     path = connected(
@@ -285,21 +285,21 @@ def plan(
         lambda: chain.looked >= last or out_of_time(),
         seed,
     )
-    if path is None or any(state not in places for state in path):
+    if path is None or any(state not in known for state in path):
         return None
-    found = [ways[path[0]], *(places[state] for state in path), ways[path[-1]]]
-    return [place for k, place in enumerate(found) if k == 0 or place is not found[k - 1]]
+    found = [ways[path[0]], *(known[state] for state in path), ways[path[-1]]]
+    return [each for k, each in enumerate(found) if k == 0 or each is not found[k - 1]]
 
 
 def _usable(
-    stops: list[ChainConfiguration], place: ChainConfiguration, room: AffineSubspace
+    stops: list[ChainConfiguration], end: ChainConfiguration, room: AffineSubspace
 ) -> list[ChainConfiguration]:
     """Select the configurations that lie in the searched set and are at least `SHORT_RETREAT` away
     from an end of the carry.
 
     Args:
         stops: the configurations.
-        place: configuration at this end of the carry, the start or the goal.
+        end: configuration at this end of the carry, the start or the goal.
         room: the searched set.
 
     Returns:
@@ -309,7 +309,7 @@ def _usable(
     return [
         stop
         for stop, y in zip(stops, at, strict=True)
-        if distance(place.extended, stop.extended) >= SHORT_RETREAT
+        if distance(end.extended, stop.extended) >= SHORT_RETREAT
         and bool(np.all((y >= room.lower) & (y <= room.upper)))
     ]
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.extras.proposing.decimals import pose_limits, readable_turns
-from hybrid_opt.extras.proposing.hand_places import hand_places, pattern_entry
+from hybrid_opt.extras.proposing.hand_positions import hand_positions, pattern_entry
 from hybrid_opt.extras.proposing.kinematics import shoulder_positions
 from symbolic import safe_io
 from symbolic.array import Array
@@ -39,7 +39,7 @@ PROPOSED = ("waypoints", "initial", "redundant")
 """Keys of the task that are always proposed anew."""
 
 MOST_SIDES = 3
-"""Places of hands with which bases are searched, the best."""
+"""Positions of hands with which bases are searched, the best."""
 
 DRAFT_HEIGHT, DRAFT_SPEED = 0.5, 0.25
 """Provisional height of the box over the bases, and of its goal over its start [m]; provisional
@@ -96,8 +96,8 @@ class Problem:
         on the box.
 
         Positions in the file are kept. Otherwise hands that grip by themselves are at the first
-        proposal of `hand_places`, and pads at the centres of the two opposite faces that face the
-        robots' bases or a machine's shoulders. Without bases in the file, pads are on the faces
+        proposal of `hand_positions`, and pads at the centres of the two opposite faces that face
+        the robots' bases or a machine's shoulders. Without bases in the file, pads are on the faces
         beside the direction of the carry.
 
         Raises:
@@ -109,7 +109,7 @@ class Problem:
             keys = ("xyz", "spin", "further") if self.has_hands else ("xyz",)
             return [{key: entry[key] for key in keys if key in entry} for entry in entries]
         if self.has_hands:
-            return self._hand_places[0]
+            return self._hand_positions[0]
         bases = self._bases
         start, goal = self.poses
         size = np.array(self.data["payload"]["size"], dtype=float)
@@ -139,7 +139,7 @@ class Problem:
         return all(entry.get("kind", "pad") != "pad" for entry in self.data["contacts"])
 
     @cached_property
-    def _hand_places(self) -> list[list[dict[str, Any]]]:
+    def _hand_positions(self) -> list[list[dict[str, Any]]]:
         """The two tables of contacts as they stand in a file, for each proposed placement of the
         arms' hands; the best first.
 
@@ -160,7 +160,7 @@ class Problem:
             {} if "base" in robot else {"base": {"xyz": [0.0, y, 0.0]}}
             for robot, y in zip(self.data["robots"], (1.0, -1.0), strict=True)
         ]
-        found = hand_places(
+        found = hand_positions(
             patterns,
             size,
             R,
@@ -187,7 +187,7 @@ class Problem:
         if self._bases is None or self.states_contacts:
             return []
         if self.has_hands:
-            return self._hand_places[1:]
+            return self._hand_positions[1:]
         R = box_placement(self.orientation, self.poses[0])[:3, :3]
         size = np.array(self.data["payload"]["size"], dtype=float)
         along = self._bases[0] - self._bases[1]
@@ -216,8 +216,8 @@ class Problem:
         """Return copies of the problem whose pads or hands are placed on different sides of the
         box.
 
-        Hands are at the best proposals of `hand_places`, one copy for each. For pads there is one
-        copy for each pair of opposite upright faces; for a machine with two arms also one with
+        Hands are at the best proposals of `hand_positions`, one copy for each. For pads there is
+        one copy for each pair of opposite upright faces; for a machine with two arms also one with
         exchanged arms. Only the problem itself is returned if the file states the positions, or if
         two separate robots move the box so far horizontally that the direction of the carry
         determines the faces.
@@ -225,7 +225,8 @@ class Problem:
         entries = self.data["contacts"]
         start, goal = self.poses
         if self.has_hands and not self.states_contacts:
-            placed = [merged(entries, place) for place in self._hand_places[:MOST_SIDES]]
+            tables = self._hand_positions[:MOST_SIDES]
+            placed = [merged(entries, each) for each in tables]
             return [replace(self, data={**self.data, "contacts": each}) for each in placed]
         level = float(np.linalg.norm((goal - start)[:2]))
         if self.states_contacts or not (self.is_machine or level < LEAST_LEVEL):

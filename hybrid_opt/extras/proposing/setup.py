@@ -128,16 +128,16 @@ def _place(task: Task, pose: Array, holds: tuple[Hold, Hold], end: int) -> Chain
     return ChainConfiguration(extended, (joints[0], joints[1]))
 
 
-def _free(judge: PoseJudge, *places: ChainConfiguration) -> bool:
+def _free(judge: PoseJudge, *configurations: ChainConfiguration) -> bool:
     """Return True if no configuration collides.
 
     Args:
         judge: checker of collisions.
-        places: the configurations.
+        configurations: the configurations.
     """
     return not any(
-        judge.colliding(place.extended[None, :POSE_SIZE], place.q[0][None], place.q[1][None])[0]
-        for place in places
+        judge.colliding(each.extended[None, :POSE_SIZE], each.q[0][None], each.q[1][None])[0]
+        for each in configurations
     )
 
 
@@ -311,7 +311,7 @@ def redundant_joints(workcell: Workcell, arm: int, common: tuple[str, ...]) -> t
     forced = [*held, *sliding][:beyond]
     kinematics = ArmKinematics(workcell, arm)
     q = kinematics.drawn(POSTURES, np.random.default_rng(0))
-    _, jacobian = kinematics.places(q)
+    _, jacobian = kinematics.pose_and_jacobian(q)
 
     def condition(joints: tuple[int, ...]) -> float:
         rest = [k for k in range(model.nq) if k not in joints]

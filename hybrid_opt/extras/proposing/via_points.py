@@ -31,7 +31,7 @@ MOST_VIA_POINTS = 6
 """Largest number of via-points of a proposal; more make a search long."""
 
 LEAST_SAMPLES = 60
-"""Smallest number of places of a spline that are checked."""
+"""Smallest number of points of a spline that are checked."""
 
 SHIFTS = 12
 """Number of random shifts of via-points that are tried if fits collide."""
@@ -46,7 +46,7 @@ OFFSPRING = 16
 """Number of splines per generation."""
 
 MEASURED = 24
-"""Number of places of a spline at which the strategy measures its length and checks collisions."""
+"""Number of points of a spline at which the strategy measures its length and checks collisions."""
 
 BLOCKED = 100.0
 """Cost of a spline that is out of reach everywhere; half as much if it collides everywhere
@@ -62,13 +62,13 @@ def path_length(points: Array) -> float:
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
-def joint_length(places: Sequence[ChainConfiguration]) -> float:
+def joint_length(path: Sequence[ChainConfiguration]) -> float:
     """Compute the Euclidean length of a path in the joint space of both arms [rad].
 
     Args:
-        places: configurations along the path.
+        path: configurations along the path.
     """
-    return path_length(np.array([np.concatenate(place.q) for place in places]))
+    return path_length(np.array([np.concatenate(each.q) for each in path]))
 
 
 def along(corners: Sequence[ChainConfiguration]) -> Array:
@@ -188,12 +188,15 @@ def shorten_spline(
 
     lever = metric_weights(waypoints.shape[1])
     basis = path_basis(len(waypoints), np.linspace(0.0, 1.0, MEASURED)).position
-    places, whole = chain.followed(basis @ waypoints, start.q)
+    configurations, whole = chain.followed(basis @ waypoints, start.q)
     if not whole:
         return waypoints
     shorter: list[tuple[float, Array]] = []
-    least = joint_length(places)
-    near = np.array([place.q[0] for place in places]), np.array([place.q[1] for place in places])
+    least = joint_length(configurations)
+    near = (
+        np.array([each.q[0] for each in configurations]),
+        np.array([each.q[1] for each in configurations]),
+    )
 
     def moved(y: Array) -> Array:
         inner = y.reshape(-1, len(lever)) / lever
@@ -211,7 +214,7 @@ def shorten_spline(
             shorter.append((float(lengths[k]), tried[k]))
         if strategy.stop():
             break
-    # All places are looked at in the end: most of these are on the way to a shorter one.
+    # All points are looked at in the end: most of these are on the way to a shorter one.
     shorter.sort(key=lambda item: item[0])
     return next((one for _, one in shorter if free_share(chain, start, one) == 1.0), waypoints)
 

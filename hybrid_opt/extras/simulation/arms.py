@@ -218,8 +218,9 @@ class CellSimulation:
         Args:
             reference: commands to both arms. Their cell may differ from the simulated one in
                 payload, friction and the positions of the pads.
-            control: 'impedance' for two position-controlled arms, 'leader' if only the arm that
-                does not lead controls its normal force, 'both' if both arms do.
+            control: 'impedance' for two position-controlled arms, 'leader' if only the
+                force-controlled arm of the commands controls its normal force, 'both' if both arms
+                do.
             factor: number by which the commanded normal forces are multiplied.
         """
         return _ArmSimulation(self, reference, control, factor).outcome()

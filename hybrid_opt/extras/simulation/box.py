@@ -218,17 +218,17 @@ class CarriageMotion:
     acceleration: Array
     rotation: Array
 
-    def acceleration_at(self, place: Array) -> Array:
+    def acceleration_at(self, point: Array) -> Array:
         """Compute the acceleration (n, 3) along box axes of a point that moves with the box frame
         [m/s^2].
 
         Args:
-            place: (3,) position of the point in the box frame [m].
+            point: (3,) position of the point in the box frame [m].
         """
         spin, spin_rate = self.velocity[:, 3:], self.acceleration[:, 3:]
         linear = np.einsum("nji,nj->ni", self.rotation, self.acceleration[:, :3])
-        turned: Array = linear + np.cross(spin_rate, place)
-        return turned + np.cross(spin, np.cross(spin, place))
+        turned: Array = linear + np.cross(spin_rate, point)
+        return turned + np.cross(spin, np.cross(spin, point))
 
     def apply(self, data: Any, k: int) -> None:
         """Set the carriage, the first body of a simulation, to its state at a time step.
@@ -305,7 +305,7 @@ def drive_of(
         carry: the carry at n samples.
         settings: settings of the simulation.
         press: (n,) pressing force at the samples [N]; None for the planned normal force of the arm
-            that does not lead.
+            other than `leader`.
         leader: index of the arm whose pad is fixed to the carriage.
         moments: moments from `planned_moments` that rotate the pads about their centres; None for
             none.

@@ -151,7 +151,7 @@ def carry_reference(
     Args:
         cell: the cell.
         carry: the carry at n samples.
-        press: (n,) commanded normal force of the arm that does not lead [N]; None for its planned
+        press: (n,) commanded normal force of the force-controlled arm [N]; None for its planned
             force.
         leader: index of the position-controlled arm. Its normal force rises above the planned one
             by as much as `press` exceeds the other arm's planned force.

@@ -312,7 +312,7 @@ def contact_points(
     T_body_box = T_body_pad @ inverse(contact.T_box_pad)
     text = []
     for pad in (contact, *contact.further):
-        around = pressed_places(pad, pads, settings.points)
+        around = pressed_points(pad, pads, settings.points)
         T = T_body_pad if pad is contact else T_body_box @ pad.T_box_pad
         text.append(point_geoms(pad, settings.layer, around, T))
     return "\n".join(text)
@@ -342,7 +342,7 @@ def patch_area(contact: Contact) -> float:
     return sum(pad.area for pad in (contact, *contact.further))
 
 
-def pressed_places(contact: Contact, pads: Pads, points: int) -> Array:
+def pressed_points(contact: Contact, pads: Pads, points: int) -> Array:
     """Compute the points (n, 2) of a patch that press on the payload, in the plane of the pad [m].
 
     Points of pads of the kind 'driven' lie evenly around the rim of a round patch, or at the

@@ -142,7 +142,7 @@ def test_what_was_planted_is_read(tmp_path: Path, write: Callable[[Path], Path])
     carry = read(write(tmp_path))
     assert carry.run.labels.mass == MASS
     assert carry.run.lost == ()
-    distance = np.linalg.norm(np.diff(carry.places.pads[:, :, :3, 3], axis=1)[:, 0], axis=1)
+    distance = np.linalg.norm(np.diff(carry.motion.pads[:, :, :3, 3], axis=1)[:, 0], axis=1)
     np.testing.assert_allclose(distance, LENGTH, atol=1e-5)
     found = compared(carry)
     np.testing.assert_allclose(found.squeeze, SQUEEZE, rtol=1e-3)

@@ -11,7 +11,7 @@ import pytest
 
 from hybrid_opt.extras.calibrating.estimate import FrictionRatio, delay
 from hybrid_opt.extras.calibrating.evidence import Evidence, calibrate
-from hybrid_opt.extras.calibrating.recording import Recording, places_of
+from hybrid_opt.extras.calibrating.recording import Recording, pad_motion
 from studies.research.plain.arm import PlainArm
 from symbolic.array import Array
 from tests.hybrid_opt.extras.calibrating.generator import (
@@ -111,17 +111,17 @@ def test_a_delay_is_found_where_there_is_one() -> None:
 def test_wrenches_in_every_frame_are_the_same() -> None:
     """Told about the flange, and along the axes of the base, by transports written here."""
     made = run(0, truth=QUIET)
-    places = places_of(CELL, made)
+    motion = pad_motion(CELL, made)
     flange, base = np.empty_like(made.wrench), np.empty_like(made.wrench)
     for i, robot in enumerate(CELL.robots):
         R, at = robot.T_flange_pad[:3, :3], robot.T_flange_pad[:3, 3]
         R_base = robot.T_world_base[:3, :3]
         for k, (force, moment) in enumerate(made.wrench[:, i].reshape(-1, 2, 3)):
             flange[k, i] = [*(R @ force), *(R @ moment + np.cross(at, R @ force))]
-            turned = R_base.T @ places.pads[k, i, :3, :3]
+            turned = R_base.T @ motion.pads[k, i, :3, :3]
             base[k, i] = [*(turned @ force), *(turned @ moment)]
     for frame, wrench in (("flange", flange), ("base", base)):
-        found = places_of(CELL, replace(made, frame=frame, wrench=wrench)).wrench
+        found = pad_motion(CELL, replace(made, frame=frame, wrench=wrench)).wrench
         np.testing.assert_allclose(found, made.wrench, atol=1e-9)
 
 
@@ -359,7 +359,7 @@ def test_holds_that_were_not_recorded_are_told() -> None:
 def test_an_empty_run_shows_whether_the_tool_is_compensated(weight: float) -> None:
     """A tool that weighs turns with the pads; the tare knows one posture."""
     made = changed(run(0, truth=QUIET), empty=True, mass=None)
-    up = places_of(CELL, made).pads[:, :, 2, :3]
+    up = pad_motion(CELL, made).pads[:, :, 2, :3]
     wrench = np.zeros_like(made.wrench)
     wrench[:, :, :3] = -weight * up
     # The arms hang the other way up at the tare.

@@ -17,11 +17,11 @@ from hybrid_opt.extras.proposing.bases import (
     ASIDE,
     LIFT_HEIGHT,
     POSES,
-    PlaceScorer,
+    BaseScorer,
     base_choices,
     draft_of,
     free_detours,
-    machine_places,
+    machine_bases,
     shared_room,
 )
 from hybrid_opt.extras.proposing.common import machine_holds
@@ -62,7 +62,7 @@ def test_placements_and_jacobians_are_pinocchios(rack_cell: Workcell) -> None:
     model = arm_model(rack_cell.robots[0])
     data = model.createData()
     q = np.random.default_rng(0).uniform(-2.0, 2.0, (20, 6))
-    T, J = kinematics.places(q)
+    T, J = kinematics.pose_and_jacobian(q)
     base = rack_cell.robots[0].T_world_base
     for k in range(len(q)):
         pin.computeJointJacobians(model, data, q[k])
@@ -79,15 +79,17 @@ def test_a_sliding_joint_moves_along_its_axis_and_all_columns_are_slopes(
     slides = replace(geometry, turning=(True, False, *geometry.turning[2:]))
     kinematics = ArmKinematics(rack_cell, 0, slides)
     q, step = np.random.default_rng(2).uniform(-1.0, 1.0, (1, 6)), 1e-6
-    T, J = kinematics.places(q)
-    (forth, _), (back, _) = (kinematics.places(q + sign * step * np.eye(6)) for sign in (1, -1))
+    T, J = kinematics.pose_and_jacobian(q)
+    (forth, _), (back, _) = (
+        kinematics.pose_and_jacobian(q + sign * step * np.eye(6)) for sign in (1, -1)
+    )
     slope = (forth - back) / (2.0 * step)
     np.testing.assert_allclose(J[0, :3], slope[:, :3, 3].T, atol=1e-9)
     turned = slope[:, :3, :3] @ T[0, :3, :3].T  # the skew matrix of the angular velocity
     np.testing.assert_allclose(J[0, 3], turned[:, 2, 1], atol=1e-9)
     np.testing.assert_allclose(J[0, 4], turned[:, 0, 2], atol=1e-9)
     np.testing.assert_allclose(J[0, 5], turned[:, 1, 0], atol=1e-9)
-    far, _ = kinematics.places(q + 0.5 * np.eye(6)[1])
+    far, _ = kinematics.pose_and_jacobian(q + 0.5 * np.eye(6)[1])
     np.testing.assert_allclose(far[0, :3, 3] - T[0, :3, 3], 0.5 * J[0, :3, 1], atol=1e-14)
     np.testing.assert_array_equal(far[0, :3, :3], T[0, :3, :3])
 
@@ -95,7 +97,7 @@ def test_a_sliding_joint_moves_along_its_axis_and_all_columns_are_slopes(
 def test_arrays_of_other_lengths_are_no_postures(rack_cell: Workcell) -> None:
     kinematics = ArmKinematics(rack_cell, 0)
     with pytest.raises(ValueError, match="length"):
-        kinematics.places(np.zeros((2, 5)))
+        kinematics.pose_and_jacobian(np.zeros((2, 5)))
     with pytest.raises(ValueError, match="length"):
         kinematics.solve(np.zeros((2, 6)), np.eye(4)[None], 1)
 
@@ -104,19 +106,19 @@ def test_newtons_method_comes_back_to_where_placements_are_from(rack_cell: Workc
     kinematics = ArmKinematics(rack_cell, 1)
     rng = np.random.default_rng(1)
     q = rng.uniform(-1.5, 1.5, (50, 6))
-    T, _ = kinematics.places(q)
+    T, _ = kinematics.pose_and_jacobian(q)
     found = kinematics.solve(q + rng.normal(0.0, 0.02, q.shape), T, 20, 1e-3)
     away = found.manipulability > 0.01
     assert away.sum() > 25
     np.testing.assert_allclose(found.q[away], q[away], atol=1e-5)
-    np.testing.assert_allclose(kinematics.places(found.q)[0], T, atol=1e-5)
+    np.testing.assert_allclose(kinematics.pose_and_jacobian(found.q)[0], T, atol=1e-5)
 
 
 def test_following_goes_where_the_joints_came_from(rack_cell: Workcell) -> None:
     kinematics = ArmKinematics(rack_cell, 0)
     begin = np.array([0.2, 0.5, 0.4, 0.3, 0.9, 0.1])
     path = begin + np.linspace(0.0, 0.4, 20)[:, None] * np.array([1, -1, 0.5, 0.2, 0.4, 1.0])
-    T, _ = kinematics.places(path)
+    T, _ = kinematics.pose_and_jacobian(path)
     found, kept, _ = kinematics.follow(begin[None], T)
     assert kept.tolist() == [20]
     np.testing.assert_allclose(found[:, 0], path, atol=1e-6)
@@ -186,7 +188,10 @@ def test_holds_hold_the_box_at_both_ends(rack_cell: Workcell) -> None:
     assert len(holds) > 1
     for hold in holds:
         for pose, q in zip(ends, (hold.q_start, hold.q_goal), strict=True):
-            T, T_world_box = kinematics.places(q[None])[0][0], pose_matrix(pose[:3], pose[3:])
+            T, T_world_box = (
+                kinematics.pose_and_jacobian(q[None])[0][0],
+                pose_matrix(pose[:3], pose[3:]),
+            )
             np.testing.assert_allclose(T, T_world_box @ kinematics.held(hold.spin), atol=1e-5)
 
 
@@ -221,7 +226,7 @@ def test_both_arms_of_a_pair_hold_the_box_with_one_waist(machine: Setup) -> None
             T_world_box = box_placement(task.orientation, pose)
             for arm, hold, q in zip(arms, pair.holds, place.q, strict=True):
                 target = T_world_box @ arm.held(hold.spin)
-                np.testing.assert_allclose(arm.places(q[None])[0][0], target, atol=1e-5)
+                np.testing.assert_allclose(arm.pose_and_jacobian(q[None])[0][0], target, atol=1e-5)
 
 
 def test_a_waist_turns_where_the_box_is_beside_the_machine(machine: Setup) -> None:
@@ -371,7 +376,7 @@ def test_a_machine_stands_where_its_arms_reach(
     for side in problem.sides()[2:]:
         left = np.array(side.contacts[0]["xyz"])
         assert left[1] != 0.0
-        for base in machine_places(side, drafted[1]):
+        for base in machine_bases(side, drafted[1]):
             across = [-np.sin(base[5]), np.cos(base[5]), 0.0]
             assert left @ across > 0.0
             ahead = np.array([np.cos(base[5]), np.sin(base[5])])
@@ -381,16 +386,16 @@ def test_a_machine_stands_where_its_arms_reach(
 def test_too_near_there_is_no_room_and_in_the_shelf_no_place(
     drafted: tuple[Problem, Workcell],
 ) -> None:
-    scorer = PlaceScorer(*drafted, SPINS, np.random.default_rng(1))
+    scorer = BaseScorer(*drafted, SPINS, np.random.default_rng(1))
     rooms = []
     for x in (0.07, 0.20):
-        arms = [scorer.place(arm, at(x)) for arm in (0, 1)]
+        arms = [scorer.rank(arm, at(x)) for arm in (0, 1)]
         assert arms[0] is not None
         assert arms[1] is not None
         rooms.append(shared_room(arms[0], arms[1]))
     assert rooms[0] > rooms[1]
-    assert scorer.place(0, at(0.6)) is None
-    assert scorer.place(0, at(-1.5)) is None, "out of reach"
+    assert scorer.rank(0, at(0.6)) is None
+    assert scorer.rank(0, at(-1.5)) is None, "out of reach"
 
 
 @pytest.mark.slow

@@ -310,7 +310,7 @@ def test_paths_hold_the_box_with_both_arms_and_are_free(
         kinematics = ArmKinematics(shelf.workcell, arm)
         q = np.array([place.q[arm] for place in path])
         T_box_joint = kinematics.held(pair.holds[arm].spin)
-        T, _ = kinematics.places(q)
+        T, _ = kinematics.pose_and_jacobian(q)
         wanted = np.array([pose_matrix(pose[:3], pose[3:]) @ T_box_joint for pose in poses])
         np.testing.assert_allclose(T, wanted, atol=1e-5)
         assert np.abs(np.diff(q, axis=0)).max() < 0.5

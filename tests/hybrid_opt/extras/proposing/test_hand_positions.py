@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hybrid_opt as ho
-from hybrid_opt.extras.proposing.hand_places import place_entry
+from hybrid_opt.extras.proposing.hand_positions import contact_entry
 from hybrid_opt.extras.proposing.kinematics import covers_the_same, rotate_about_normal
 from hybrid_opt.extras.proposing.problem import Problem, read_problem
 from hybrid_opt.robust.budget import required_at_rest
@@ -75,7 +75,7 @@ def test_a_place_is_read_as_it_was_written(name: str) -> None:
     for contact in load(f"studies/workcells/{name}.toml").contacts:
         turned = rotate_about_normal(contact, np.pi)
         assert covers_the_same(contact, turned)
-        entry = place_entry(turned)
+        entry = contact_entry(turned)
         assert len(entry.get("further", [])) == len(contact.further)
         np.testing.assert_allclose(entry["xyz"], turned.T_box_pad[:3, 3], atol=1e-9)
 

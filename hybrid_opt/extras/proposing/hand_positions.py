@@ -1,4 +1,4 @@
-"""Places on a box for hands that hold by themselves: faces, heights and turns, ranked by the
+"""Positions on a box for hands that hold by themselves: faces, heights and turns, ranked by the
 holding force that the payload at rest requires in every case of the uncertainty.
 
 All hands of an arm move as one pattern, such as an array of cups or the fingers of a gripper.
@@ -23,13 +23,13 @@ from symbolic.records import Contact, Workcell
 from symbolic.records.poses import inverse, pose_matrix, transform
 
 HEIGHTS = ((0.0, 0.0), (0.5, 0.0), (-0.5, 0.0), (1.0, 0.0), (-1.0, 0.0))
-"""Tried places of hands on opposite faces, the same for both arms, along both axes of the face.
+"""Tried positions of hands on opposite faces, the same for both arms, along both axes of the face.
 The unit is the free distance between hands and edges; the first axis points upwards on upright
 faces."""
 
 BESIDE = tuple(k * np.array(way) for way in ((1, 0), (-1, 0), (0, 1), (0, -1)) for k in (1.0, 0.5))
-"""Tried places of the first arm's hands if both arms' hands share a face: at the edges and halfway
-to them. The other arm's hands are placed opposite."""
+"""Tried positions of the first arm's hands if both arms' hands share a face: at the edges and
+halfway to them. The other arm's hands are placed opposite."""
 
 EDGE = 0.005
 """Least distance of a patch from the edges of its face [m]."""
@@ -37,8 +37,8 @@ EDGE = 0.005
 DOWNWARDS = -0.7
 """Vertical component of a face's outward normal below which no hand can reach the face."""
 
-MOST_PLACES = 16
-"""Largest number of places of both arms' hands that are returned."""
+MOST_PROPOSALS = 16
+"""Largest number of pairs of positions of both arms' hands that are returned."""
 
 Both = tuple[Contact, Contact]
 
@@ -66,7 +66,7 @@ def pattern_entry(entry: Entry, thickness: float) -> Entry:
     return entry | first | ({"further": further} if further else {})
 
 
-def place_entry(contact: Contact, with_normals: bool = False) -> Entry:
+def contact_entry(contact: Contact, with_normals: bool = False) -> Entry:
     """Return the keys of a contact's table in a file that state where its hands or pads are on the
     box: `xyz`, `spin` and `further`.
 
@@ -84,7 +84,7 @@ def place_entry(contact: Contact, with_normals: bool = False) -> Entry:
     return first | ({"further": further} if further else {})
 
 
-def hand_places(
+def hand_positions(
     patterns: Sequence[Contact],
     size: Array,
     rotations: Array,
@@ -114,15 +114,15 @@ def hand_places(
     ]
     if not pairs:
         return []
-    cell = workcell([place_entry(contact) for contact in pairs[0]])
+    cell = workcell([contact_entry(contact) for contact in pairs[0]])
     pairs = list(_with_tools_outside(cell, pairs))
 
     def share(pair: Both) -> float:
         required = required_at_rest(replace(cell, contacts=pair))
         return round(float((required / cell.task.reference_force).max()), 3)
 
-    best = sorted(pairs, key=share)[:MOST_PLACES]
-    return [[place_entry(contact) for contact in pair] for pair in best]
+    best = sorted(pairs, key=share)[:MOST_PROPOSALS]
+    return [[contact_entry(contact) for contact in pair] for pair in best]
 
 
 def _with_tools_outside(cell: Workcell, pairs: Sequence[Both]) -> Iterator[Both]:
@@ -182,7 +182,7 @@ def _pairs(patterns: Sequence[Contact], size: Array, rotations: Array) -> Iterat
 
 
 def _placed(
-    pattern: Contact, outward: Array, size: Array, turn: float, place: Array
+    pattern: Contact, outward: Array, size: Array, turn: float, at: Array
 ) -> Contact | None:
     """Return a contact with its hands on a face of a box; None if the face has too little room.
 
@@ -191,7 +191,7 @@ def _placed(
         outward: (3,) outward normal of the face in the box frame, along one of its axes.
         size: (3,) edges of the box [m].
         turn: rotation of the hands about the normal of the face [rad].
-        place: (2,) position of the hands on the face, along the face's two axes: 0 is its middle,
+        at: (2,) position of the hands on the face, along the face's two axes: 0 is its middle,
             -1 and 1 are its edges.
     """
     face = pad_rotation(-outward, 0.0)
@@ -203,7 +203,7 @@ def _placed(
     room = np.abs(face[:, :2].T) @ (size / 2.0 - half) - EDGE
     if (room < 0.0).any():
         return None
-    middle = outward * size / 2.0 + face[:, :2] @ (room * place)
+    middle = outward * size / 2.0 + face[:, :2] @ (room * at)
     return moved(pattern, transform(rotation, middle - rotation[:, :2] @ (low + high) / 2.0))
 
 
