@@ -24,9 +24,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     __version__: str
     from hybrid_opt.api import compare_timings as compare_timings
-    from hybrid_opt.api import polish as polish
     from hybrid_opt.api import save as save
-    from hybrid_opt.api import search as search
     from hybrid_opt.api import time_path as time_path
     from hybrid_opt.api import time_with_jerk as time_with_jerk
     from hybrid_opt.branches import search_branches as search_branches
@@ -54,6 +52,8 @@ if TYPE_CHECKING:
     from hybrid_opt.extras.sweeping import sweep as sweep
     from hybrid_opt.extras.workbench import live as live
     from hybrid_opt.front import Front as Front
+    from hybrid_opt.front import polish as polish
+    from hybrid_opt.front import search as search
     from hybrid_opt.job.plan import plan_job as plan_job
     from hybrid_opt.job.records import Job as Job
     from hybrid_opt.metaheuristics.algorithms import GeneticSettings as GeneticSettings

@@ -1,5 +1,5 @@
-"""Fronts (non-dominated feasible carries of a search or polish), and the choice of one carry of a
-front.
+"""Fronts: non-dominated feasible carries, made by a search and improved by a polish; and the choice
+of one carry of a front.
 
 The balanced carry has the least mean of both robots' peak normal forces. A polished front is flat
 where one robot can relieve the other at no cost: the means of many points agree to five digits. Of
@@ -10,21 +10,27 @@ knee is selected.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.carry import Carry
+from hybrid_opt.carry import Carry, decision_of
 from hybrid_opt.cell import Cell
 from hybrid_opt.display_protocol import Displayable
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
 from hybrid_opt.evaluate.objectives import front_rows
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.records import PolishedFront
+from hybrid_opt.polishing.settings import PolishSettings, default_settings
+from hybrid_opt.progress import ShowProgress, as_callback, progress_bar
 from symbolic.array import Array, set_read_only
 from symbolic.errors import SettingsError
+
+if TYPE_CHECKING:
+    from hybrid_opt.metaheuristics.run import SearchSettings
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -193,6 +199,100 @@ class Front(Displayable):
                 "evaluations or the task wider bounds",
                 code="empty-front",
             )
+
+
+# --- how fronts are made ---
+
+
+def search(
+    cell: Cell,
+    algorithm: str = "nsga2",
+    *,
+    evaluations: int = 1000,
+    rng: np.random.Generator,
+    settings: SearchSettings | None = None,
+    progress: ShowProgress = False,
+) -> Front:
+    """Search for non-dominated carries and return them as a front.
+
+    Args:
+        cell: the cell to search.
+        algorithm: name of the search algorithm, one of `algorithms()`.
+        evaluations: largest number of candidates to evaluate.
+        rng: random generator; the same state gives exactly the same front.
+        settings: settings of the search, None for the defaults. Without initial candidates in
+            the settings, the first generation contains the cell's hand-made trajectory, except
+            in the random search.
+        progress: True for a progress bar, or a function that is called with the number of
+            candidates evaluated and their total.
+
+    Raises:
+        SettingsError: an unknown algorithm or a value that is not allowed.
+        WorkcellError: the payload cannot be held still, so that there is nothing to search for.
+    """
+    # Not imported at the top: the searches take long to load.
+    from hybrid_opt.metaheuristics.run import SearchSettings, make, search_carries
+
+    settings = settings or SearchSettings()
+    make(algorithm, settings.algorithm)  # refuses mistakes before anything is compiled
+    evaluator = cell.holding_evaluator
+    if settings.initial is None and algorithm != "random":
+        settings = replace(settings, initial=cell.initial[None])
+    with progress_bar(progress, algorithm, evaluations) as advance:
+        found, _ = search_carries(
+            evaluator, algorithm, evaluations, rng, settings, advance, cell.workcell.task
+        )
+    return Front.of_search(cell, algorithm, found)
+
+
+def polish(
+    front: Front,
+    *,
+    rng: np.random.Generator,
+    settings: PolishSettings | None = None,
+    paths: Sequence[Carry | Array] = (),
+    progress: ShowProgress = False,
+) -> Front:
+    """Improve the carries of a front by nonlinear programming and return the polished front.
+
+    The polish lowers both peak normal forces. In drivable cells it lowers duration and force
+    instead, by optimising path and speed profile together.
+
+    Args:
+        front: the front to improve.
+        rng: random generator that perturbs the starts of some attempts.
+        settings: settings of the polish, None for the defaults of the cell's time law.
+        paths: further good carries of the same cell from which attempts start, or their decision
+            vectors (n_var,), or (n_path,) without the force limit; only for drivable cells. No
+            given path dominates a point of the result. The hand-made path is always a start.
+        progress: True for a progress bar, or a function that is called with the number of attempts
+            done and the number expected in all; the second number may change.
+
+    Raises:
+        SettingsError: the polish does not support the cell's objectives, or a path does not fit.
+    """
+    cell, task = front.cell, front.cell.workcell.task
+    settings = settings or default_settings(task.law.is_drivable)
+    polisher = cell.polisher(settings)
+    known = [np.asarray(decision_of(path), dtype=float) for path in paths]
+    if known and not task.law.is_drivable:
+        raise SettingsError(
+            f"known paths take part in polishes of drivable carries only; this one has "
+            f"{task.law.title}: polish the front of Cell.drivable()"
+        )
+    for path in known:
+        if path.shape not in ((task.n_path,), (task.n_var,)) or not np.isfinite(path).all():
+            raise SettingsError(
+                f"a known path of shape {path.shape}; needs {task.n_path} finite numbers, or "
+                f"{task.n_var} with a force limit"
+            )
+    beside = np.array([path[: task.n_path] for path in known]).reshape(-1, task.n_path)
+    with progress_bar(progress, "polish", settings.attempts) as advance:
+        done = polisher.polish(front.x, rng, paths=beside, on_progress=as_callback(advance))
+    return front.after(done)
+
+
+# --- the choice of one carry ---
 
 
 TIE = 3e-4

@@ -11,12 +11,11 @@ import json
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 
-from hybrid_opt.api import polish
 from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.results import is_whole, read_campaign, read_polished
 from hybrid_opt.campaign.settings import CampaignSettings, polished_file
 from hybrid_opt.campaign.stages import Stage, loaded_cell, store_results
-from hybrid_opt.front import Front
+from hybrid_opt.front import Front, polish
 from hybrid_opt.polishing.front import use_one_thread
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.progress import Progress, ShowProgress

@@ -9,12 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_opt.api import search
 from hybrid_opt.campaign.candidates import EvaluatedCandidates, encode
 from hybrid_opt.campaign.folder import CampaignFolder
 from hybrid_opt.campaign.results import is_whole, read_replica
 from hybrid_opt.campaign.settings import CampaignSettings, replica_file
 from hybrid_opt.campaign.stages import ReplicaFunction, Stage, loaded_cell, store_results
+from hybrid_opt.front import search
 from hybrid_opt.metaheuristics.run import SearchSettings
 from hybrid_opt.progress import Progress, ShowProgress
 from symbolic.read.cell_files import CellFiles

@@ -18,11 +18,10 @@ from typing import Any
 import numpy as np
 
 from codegen.cache import digest
-from hybrid_opt.api import polish
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import Evaluations
-from hybrid_opt.front import Front
+from hybrid_opt.front import Front, polish
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from hybrid_opt.progress import ShowProgress, progress_bar
 from hybrid_opt.recommending.choice import (

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from hybrid_opt.api import save, search, time_path
+from hybrid_opt.api import save, time_path
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.solids import Solid, cell_solids, frame_placements, motion_points
@@ -21,6 +21,7 @@ from hybrid_opt.errors import DisplayError, ResultsError
 from hybrid_opt.evaluate.explanation import explain
 from hybrid_opt.extras.bundles.bundle import export
 from hybrid_opt.extras.bundles.targets import TARGETS
+from hybrid_opt.front import search
 from hybrid_opt.job.plan import plan_job
 from hybrid_opt.metaheuristics.run import SearchSettings
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces

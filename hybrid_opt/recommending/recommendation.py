@@ -290,7 +290,7 @@ def _require_members(cell: Cell, front: Front) -> None:
             "the front of cell.drivable()",
             code="not-drivable",
         )
-    if len(front) == 0:
+    if len(front.x) == 0:
         raise SettingsError(
             "the drivable front is empty: no feasible carry was found; give the search more "
             "evaluations or the task wider bounds",

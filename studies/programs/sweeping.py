@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from hybrid_opt.api import polish, search
 from hybrid_opt.campaign.stages import build_study
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import Table, number
 from hybrid_opt.extras.sweeping import Sweep, read_sweep, require_keys, sweep
+from hybrid_opt.front import polish, search
 from hybrid_opt.progress import Progress
 from hybrid_opt.recommending.recommendation import recommend
 from hybrid_opt.store.files import to_json

@@ -12,12 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_opt.api import polish
 from hybrid_opt.campaign.stages import loaded_cell
 from hybrid_opt.errors import ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
-from hybrid_opt.front import Front
+from hybrid_opt.front import Front, polish
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.front import use_one_thread
 from hybrid_opt.polishing.records import PolishedFront

@@ -26,12 +26,12 @@ import numpy as np
 
 from codegen.build import compile_function
 from codegen.interpreted import InterpretedFunction
-from hybrid_opt.api import polish, search, time_path
+from hybrid_opt.api import time_path
 from hybrid_opt.cell import Cell
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.display.table import number, text_table
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.front import Front
+from hybrid_opt.front import Front, polish, search
 from hybrid_opt.polishing.settings import PolishSettings
 from studies.research.plain.candidate import PlainEvaluator, PlainJudge
 from studies.research.side_by_side import compare, table

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt.api import search
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import number, text_table
+from hybrid_opt.front import search
 from studies.research.turns import POPULATION, Evaluate, interleaved, progress
 from symbolic.array import Array
 from symbolic.geometry.pieces import Hull

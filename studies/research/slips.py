@@ -11,12 +11,12 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_opt.api import search
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.errors import SimulationError
 from hybrid_opt.extras.simulation.box import BoxSimulation, Outcome, bisected, drive_of
 from hybrid_opt.extras.simulation.scene import SimulationSettings
+from hybrid_opt.front import search
 from hybrid_opt.store.files import read_record, to_json, write_json
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array, Figure

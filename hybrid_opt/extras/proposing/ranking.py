@@ -8,11 +8,11 @@ from tempfile import TemporaryDirectory
 
 import numpy as np
 
-from hybrid_opt.api import polish, search
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.display.table import Table, number
 from hybrid_opt.extras.proposing.proposal import Proposal
+from hybrid_opt.front import polish, search
 from symbolic.errors import DualArmError
 
 
