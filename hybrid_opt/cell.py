@@ -41,7 +41,7 @@ from symbolic.records.task import initial_decision
 if TYPE_CHECKING:
     # Not imported at run time before they are needed: a search needs none of them.
     from hybrid_opt.collision.certify import Certificate
-    from hybrid_opt.polishing.cell import PolishFunctions
+    from hybrid_opt.polishing.functions import PolishFunctions
     from hybrid_opt.polishing.polisher import Polisher
     from hybrid_opt.polishing.settings import PolishSettings
     from hybrid_opt.robust.budget import GripBudget
@@ -228,7 +228,7 @@ class Cell:
     @cached_property
     def polish_functions(self) -> PolishFunctions:
         """Compiled functions of the polish."""
-        from hybrid_opt.polishing.cell import polish_functions
+        from hybrid_opt.polishing.functions import polish_functions
 
         return polish_functions(self.compiled)
 

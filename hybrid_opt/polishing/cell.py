@@ -1,238 +1,49 @@
-"""Shared data of a cell's programs: compiled functions, points of the path, scaled variables."""
+"""A cell of a polish: points of the path and scaled variables, which all of its programs share, and
+candidates evaluated on the task's samples and at the points between them."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from functools import cache, partial
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache, partial
+from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from codegen.function import NumericFunction
-from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
+from hybrid_opt.polishing.functions import PolishFunctions
 from hybrid_opt.polishing.robust import RobustSamples
 from symbolic.array import Array
-from symbolic.cell_model import CellBodies, CellModel
 from symbolic.contact.registry import contact_model
-from symbolic.limit_coefficients import TIMING_BARRIER_WEIGHT
-from symbolic.path.spline import extended_waypoints, path_basis
-from symbolic.records.cell import Workcell
+from symbolic.path.spline import extended_waypoints, path_basis, place_redundant
 from symbolic.records.task import POSE_SIZE, Task
-from symbolic.smooth.driven import driven_functions
-from symbolic.smooth.passage import GAPS, AxisSwitchGap, SeparatingAxisGap, gap_function
+from symbolic.robot.arm import REACH_TOLERANCE
+from symbolic.smooth.passage import GAPS
 from symbolic.smooth.path_points import (
-    ORDERS,
-    JointLimit,
     ManipulabilityLimit,
-    Order,
-    PathConstraint,
-    PathPointSymbols,
-    closure_functions,
-    closure_name,
-    row_function,
-    row_name,
 )
 from symbolic.smooth.samples import (
-    Quantity,
-    grasp_force_functions,
-    grasp_force_name,
     sample_blocks,
-    sample_functions,
 )
-
-PRECOMPILED = (
-    ManipulabilityLimit(0),
-    ManipulabilityLimit(1),
-    SeparatingAxisGap(0, 0),
-    AxisSwitchGap(0, 0, 1),
-    JointLimit(0, 0, "lower"),
-    JointLimit(1, 0, "lower"),
-)
-"""One member of each family of constraints whose functions are made at once, because nearly
-every solve needs them. Each clearance is a family of its own; a cell has hundreds and a solve needs
-few, so their functions are made on first use and cached."""
-
-ARMS = (0, 1)
 
 POINT_SPACING = 0.0025
 """Approximate distance of neighbouring points in the path parameter. The clearance covers minima
 between two points, and the final certification checks them."""
 
-Indices = NDArray[np.intp]
+SEPARATING_AXES_BELOW = 0.1
+"""Lower bounds of the payload's distances that are smaller than this are improved by the gaps along
+separating axes [m]."""
 
+MINIMA_BELOW = 0.1
+"""Minima between points are interpolated only for pairs that come closer than this [m]."""
 
-class PolishFunctions:
-    """Compiled functions for the polish of one workcell.
+DISTANCE_BATCH = 8
+"""Number of distances that are measured together in the search for the first violation."""
 
-    Attributes:
-        built: the functions by name, described in `symbolic.smooth`: forces and pressure at
-            samples, inverse kinematics of both arms, in drivable cells limits along a driven path,
-            and constraints at points of the path. Functions for other constraints are added on
-            first use.
-        closure: `closure(arm, order)` returns the function from the box pose to the joint positions
-            of an arm, with first or second derivatives, see `symbolic.smooth.path_points`.
-        row: `row(constraint, order)` returns the function of a constraint at a point, with first or
-            second derivatives, see `symbolic.smooth.path_points.row_function`.
-        numbers: `numbers(constraint)` returns the constraint's parameters (n,).
-        arms: `arms(constraint)` returns the indices of the arms on whose joints the constraint
-            depends.
-        model: arms and bodies of the cell.
-        separable: indices of the pairs of the payload and an obstacle that is a single box, for
-            which `gaps` computes gaps.
-    """
-
-    def __init__(self, compiled: CompiledCell, built: Mapping[str, NumericFunction]) -> None:
-        self.model, self.built, self._cell = compiled.bodies, dict(built), compiled
-        self._point, self._symbols = PathPointSymbols(self.model), cache(PathPointSymbols)
-        # Every iteration asks for all of its rows.
-        self.row, self.closure = cache(self._row), cache(self._closure)
-        self.numbers, self.arms = cache(self._numbers), cache(self._arms)
-        self._obstacle = cache(self._point.obstacle)
-        self.separable = frozenset(self._point.separable())
-
-    def _closure(self, arm: int, order: Order) -> NumericFunction:
-        return self.built[closure_name(arm, order)]
-
-    def _row(self, constraint: PathConstraint, order: Order) -> NumericFunction:
-        name = row_name(constraint.family, order)
-        if name not in self.built:
-
-            def make(model: CellBodies) -> dict[str, ca.Function]:
-                return {name: row_function(self._symbols(model), constraint, order)}
-
-            self.built |= self._cell.functions(f"polish {name}", make, lanes=0, taped=True)
-        return self.built[name]
-
-    def _numbers(self, constraint: PathConstraint) -> Array:
-        return constraint.numbers(self._point)
-
-    def _arms(self, constraint: PathConstraint) -> tuple[int, ...]:
-        return constraint.arms(self.model)
-
-    def gaps(self, pair: int, pose: Array) -> Array:
-        """Compute the gaps between the payload and an obstacle box along several directions.
-
-        A gap is the distance between the projections of both bodies onto the direction, negative if
-        the projections overlap. The largest gap is a lower bound of the distance of the bodies.
-
-        Args:
-            pair: index of the pair of payload and obstacle, one of `separable`.
-            pose: (n, 6) box poses [m, rad].
-
-        Returns:
-            (n, SEPARATING_DIRECTIONS) gaps [m].
-        """
-        return self.built[GAPS].batch(pose, self._obstacle(pair))["gaps"]
-
-
-def sample_quantities(workcell: Workcell) -> tuple[Quantity, ...]:
-    """Return what the polish of a cell evaluates at the samples of a carry, by name.
-
-    The names are 'force' (normal forces) and, if it is limited, 'pressure' (shift of the centre of
-    pressure). Pads whose forces have no closed form have 'load' instead: the force and moment that
-    the box needs, from which a convex program computes the forces. Drivable cells have none,
-    because their limits apply at the intervals of the timing.
-
-    Args:
-        workcell: the cell.
-    """
-    if workcell.task.law.is_drivable:
-        return ()
-    model = contact_model(workcell)
-    if model.has_closed_form:
-        return ("force", "pressure") if model.has_pressure_limit else ("force",)
-    return ("load",)
-
-
-def polish_functions(compiled: CompiledCell) -> PolishFunctions:
-    """Load the compiled functions for the polish of a workcell, or build them.
-
-    Functions of many samples or points per call are compiled for evaluation in lanes (several
-    evaluations by one vector instruction) at optimisation level 1. Higher levels take three times
-    as long to compile and gain nothing (measured on the rack: every function within 5 %, one slower
-    by 40 %). For the first and the last two samples, only second derivatives are evaluated in
-    lanes. Functions of whole paths multiply sparse matrices and have no form for lanes.
-
-    Raises:
-        DualArmError: the cell's model cannot be built, or its functions cannot be compiled.
-    """
-    quantities = sample_quantities(compiled.workcell)
-    ends = {f"{q}_{block}_first" for q in quantities for block in ("first", "last", "path")}
-    levels = dict.fromkeys(sorted(_names(quantities) - ends), 1)
-    wide = levels.keys() - {f"{q}_path_second" for q in quantities}
-
-    @cache
-    def samples(model: CellModel) -> dict[str, ca.Function]:
-        found = [sample_functions(model.workcell, quantity) for quantity in quantities]
-        found += [closure_functions(model, arm) for arm in ARMS]
-        return {name: function for functions in found for name, function in functions.items()}
-
-    def lane_functions(model: CellModel) -> dict[str, ca.Function]:
-        return {name: f for name, f in samples(model).items() if name in wide}
-
-    def scalar_functions(model: CellModel) -> dict[str, ca.Function]:
-        return {name: f for name, f in samples(model).items() if name not in wide}
-
-    def rows(model: CellModel) -> dict[str, ca.Function]:
-        point = PathPointSymbols(model)
-        found = {
-            row_name(constraint.family, order): row_function(point, constraint, order)
-            for constraint in PRECOMPILED
-            for order in ORDERS
-        }
-        return found | {GAPS: gap_function(point)}
-
-    details = str(levels)
-    taped = partial(compiled.functions, levels=levels, lanes=0, taped=True)
-    built = taped("polish in lanes", lane_functions, details, bodies=False)
-    built |= compiled.functions("polish", scalar_functions, details, levels=levels, bodies=False)
-    built |= taped("polish rows", rows, details)
-    if "load" in quantities:
-        built |= taped("held", _held, bodies=False)
-    if compiled.workcell.task.law.is_drivable:
-        built |= taped("driven", driven_functions, bodies=False)
-        if not contact_model(compiled.workcell).has_closed_form:
-            built |= taped("driven held", _driven_held, bodies=False)
-    return PolishFunctions(compiled, built)
-
-
-def _held(model: CellModel) -> dict[str, ca.Function]:
-    return grasp_force_functions(model.workcell)
-
-
-def _driven_held(model: CellModel) -> dict[str, ca.Function]:
-    """Build the functions that compute the pads' forces by a convex program.
-
-    The weight of the program's logarithmic barrier is that of the timing, so that polish and timing
-    compute equal forces.
-
-    Args:
-        model: arms and bodies of the cell.
-
-    Returns:
-        CasADi functions by name.
-    """
-    return grasp_force_functions(model.workcell, TIMING_BARRIER_WEIGHT)
-
-
-def _names(quantities: tuple[Quantity, ...]) -> set[str]:
-    """Return the names of all functions that `polish_functions` builds.
-
-    Args:
-        quantities: what is evaluated at samples: 'force', 'pressure' or 'load', as far as the cell
-            needs it.
-    """
-    blocks = ("inner", "first", "last", "path")
-    return {
-        GAPS,
-        *(f"{q}_{block}_{order}" for q in quantities for block in blocks for order in ORDERS),
-        *(grasp_force_name(order) for order in ORDERS),
-        *(closure_name(arm, order) for arm in ARMS for order in ORDERS),
-        *(row_name(constraint.family, order) for constraint in PRECOMPILED for order in ORDERS),
-    }
+Stretch = tuple[slice, int]
+"""A range of points of the path, as a slice with a start, and the index of a pair."""
 
 
 class Grid:
@@ -371,3 +182,301 @@ class SmoothCell:
         points[self.free] = x[: self._n_path]
         turns = points[1:, 3:POSE_SIZE] - points[:-1, 3:POSE_SIZE]
         return extended_waypoints(self.task, x) if np.abs(turns).max() > np.pi else points
+
+
+# --- candidates at the points of the path ---
+
+
+@dataclass(frozen=True)
+class PlacedCarry:
+    """A candidate evaluated at m points along the path, and at the task's n samples.
+
+    Attributes:
+        waypoints: (n_waypoints, 6 + k) box poses of the waypoints, each followed by k redundant
+            joints [m, rad].
+        pose, rate: (m, 6) box poses [m, rad] and their first derivatives by the path parameter.
+        q: (m, joints) joint positions of each arm [rad]; undefined from point `reached` on.
+        reached: number of points before the first one out of an arm's reach.
+        unreachable_arms: indices of the arms that do not reach all points.
+        manipulability: (reached, 2) absolute determinant of each arm's Jacobian over its least
+            allowed value.
+        split: (n, 2) two quantities [N] from which the normal forces follow: for soft fingers both
+            normal forces, else normal component and tangential magnitude of the required force.
+            Undefined in drivable cells and if the pads do not face each other.
+        force: (n, 2) normal forces that are minimised, planned or robust [N].
+        peak: (2,) largest of these forces of each robot over its reference force.
+        shift: (n, 2) shifts of the centres of pressure over the patch radii.
+        distances: distances of all checked pairs of bodies at the points within reach.
+        gaps: function from the index of a pair of the payload and a single obstacle box to its gaps
+            along several directions (reached, SEPARATING_DIRECTIONS) [m].
+    """
+
+    waypoints: Array
+    pose: Array
+    rate: Array
+    q: tuple[Array, Array]
+    reached: int
+    unreachable_arms: tuple[int, ...]
+    manipulability: Array
+    split: Array
+    force: Array
+    peak: Array
+    shift: Array
+    distances: Distances = field(repr=False)
+    gaps: Callable[[int], Array] = field(repr=False)
+
+    @property
+    def is_reachable(self) -> bool:
+        """True if both arms reach all points."""
+        return self.reached == len(self.pose)
+
+
+def local_minima_below(values: Array, limit: float, stride: int | None = None) -> list[int]:
+    """Find the lowest value in every stretch of a curve below a limit.
+
+    A stretch is a longest possible run of successive values below the limit.
+
+    Args:
+        values: (n,) values along the path.
+        limit: the limit, in the unit of the values.
+        stride: distance, as a number of values, at which further points of each stretch are
+            returned on both sides of the lowest value; None for the lowest values alone.
+
+    Returns:
+        Indices of the values found.
+    """
+    below = values < limit
+    if not below.any():
+        return []
+    edges = np.diff(np.concatenate([[0], below.astype(np.int8), [0]]))
+    points: list[int] = []
+    for start, stop in zip(
+        np.flatnonzero(edges == 1).tolist(), np.flatnonzero(edges == -1).tolist(), strict=True
+    ):
+        least = start + int(np.argmin(values[start:stop]))
+        if stride is None:
+            points.append(least)
+        else:
+            points += range(least - (least - start) // stride * stride, stop, stride)
+    return points
+
+
+def interpolate_minima(clearance: Array) -> Array:
+    """Estimate the minima of clearances between sampled points, and lower the samples beside them
+    to these minima.
+
+    While a body passes an edge, its clearance falls linearly to a kink and then rises linearly. The
+    minimum is the intersection of two lines: one through the last two samples before the kink, one
+    through the first two samples after it.
+
+    Args:
+        clearance: (n, k) clearances [m] of k pairs of bodies at n successive points.
+
+    Returns:
+        (n, k) clearances [m]. Where there is a kink between two samples, both are lowered to the
+        estimated minimum.
+    """
+    low = clearance.copy()
+    if len(clearance) < 4:
+        return low
+    before, left, right, after = (clearance[i : len(clearance) - 3 + i] for i in range(4))
+    falling, rising = before - left, after - right
+    both = (falling > 0.0) & (rising > 0.0)
+    slopes = np.where(both, falling + rising, 1.0)
+    share = np.where(both, (left - right + rising) / slopes, 0.0)
+    kink = np.where((share > 0.0) & (share < 1.0), left - falling * share, np.inf)
+    low[1:-2] = np.minimum(low[1:-2], kink)
+    low[2:-1] = np.minimum(low[2:-1], kink)
+    return low
+
+
+class Distances:
+    """Distances between the pairs of bodies of one candidate at n points of its path.
+
+    A distance is measured when it is first needed, and stored.
+
+    Attributes:
+        bounds: (n, n_pairs) lower bounds of the distances [m].
+        interpolated_clearance: (n, n_pairs) these bounds, lowered to their minima between points
+            [m].
+    """
+
+    def __init__(
+        self, bounds: Array, measure: Callable[..., object], configuration: Sequence[NDArray[Any]]
+    ) -> None:
+        """Estimate the distance of each pair of bodies at n points from lower bounds; nothing is
+        measured yet.
+
+        Bounds of close pairs are lowered by `interpolate_minima`.
+
+        Args:
+            bounds: (n, n_pairs) lower bounds of the distances [m].
+            measure: `CollisionChecker.measure`, which raises chosen bounds to measured distances in
+                place.
+            configuration: the first three arguments of `measure`: box poses, and joint positions of
+                the first and of the second arm, at the n points.
+        """
+        near = bounds.min(axis=0, initial=np.inf) < MINIMA_BELOW
+        self.bounds, self.interpolated_clearance = bounds, bounds.copy()
+        self.interpolated_clearance[:, near] = interpolate_minima(bounds[:, near])
+        self._measure, self._configuration = measure, configuration
+        self._values = self.interpolated_clearance.copy()
+        self._unmeasured = np.ones(bounds.shape, dtype=np.bool_)
+
+    def closer_than(self, limits: Array) -> dict[int, Array]:
+        """Find the pairs of bodies that may be closer than their limits, and measure their
+        distances.
+
+        Args:
+            limits: (n_pairs,) limit of each pair [m].
+
+        Returns:
+            By index of the pair, distances (n,) at all points [m], for each pair whose lower bound
+            is below its limit at some point. Distances are measured at these points; elsewhere a
+            lower bound may take the place of the distance.
+        """
+        close = self.interpolated_clearance < limits
+        self._measure_pairs(*(close & self._unmeasured).nonzero())
+        pairs = np.flatnonzero(close.any(axis=0)).tolist()
+        return {pair: self._values[:, pair].copy() for pair in pairs}
+
+    def _measure_pairs(self, points: NDArray[np.intp], pairs: NDArray[np.intp]) -> None:
+        if not len(points):
+            return
+        rows, local = np.unique(points, return_inverse=True)
+        wanted = np.zeros((len(rows), self.bounds.shape[1]), dtype=np.bool_)
+        wanted[local, pairs] = True
+        raised = self.bounds[rows]
+        self._measure(*(part[rows] for part in self._configuration), raised, wanted)
+        self._values[points, pairs] += raised[local, pairs] - self.bounds[points, pairs]
+        self._unmeasured[points, pairs] = False
+
+    def least(self, stretches: Sequence[Stretch], below: float) -> list[float]:
+        """Return the least distance [m] in each of several stretches of the path.
+
+        In a stretch the distance with the lowest bound is measured first, then the next one, until
+        a measured distance is below all remaining bounds. If all bounds of a stretch reach `below`,
+        the least bound is returned.
+
+        Args:
+            stretches: for each stretch, the slice of its successive points and the index of the
+                pair of bodies.
+            below: only distances with lower bounds below this one are measured [m].
+        """
+        open_, found = list(range(len(stretches))), [np.inf] * len(stretches)
+        while open_:
+            lowest = dict[int, tuple[int, int]]()
+            for k in open_:
+                where, pair = stretches[k]
+                point = where.start + int(self._values[where, pair].argmin())
+                found[k] = float(self._values[point, pair])
+                if self._unmeasured[point, pair] and self.bounds[point, pair] < below:
+                    lowest[k] = point, pair
+            chosen = np.array(sorted(set(lowest.values())), dtype=np.intp).reshape(-1, 2)
+            self._measure_pairs(chosen[:, 0], chosen[:, 1])
+            open_ = list(lowest)
+        return found
+
+    def exceed(self, limits: Array) -> bool:
+        """Return True if no pair of bodies is closer than its limit at any point.
+
+        Distances are measured in order of their lower bounds, the least first. A distance below its
+        limit ends the search.
+
+        Args:
+            limits: (n_pairs,) least allowed distance of each pair [m].
+        """
+        points, pairs = (self.interpolated_clearance < limits).nonzero()
+        order = np.argsort(self.interpolated_clearance[points, pairs], kind="stable")
+        for first in range(0, len(order), DISTANCE_BATCH):
+            some = order[first : first + DISTANCE_BATCH]
+            fresh = some[self._unmeasured[points[some], pairs[some]]]
+            self._measure_pairs(points[fresh], pairs[fresh])
+            if (self._values[points[some], pairs[some]] < limits[pairs[some]]).any():
+                return False
+        return True
+
+
+class CarryReader:
+    """Evaluates candidates of one cell at points along the path."""
+
+    def __init__(self, cell: SmoothCell) -> None:
+        self._cell = cell
+        self._manipulability = [
+            cell.functions.row(ManipulabilityLimit(arm), "first") for arm in (0, 1)
+        ]
+        self._radii = [contact.patch_radius for contact in cell.workcell.contacts]
+        # Drivable carries have no rows of forces at samples.
+        self._split_of = (
+            None if cell.task.law.is_drivable else contact_model(cell.workcell).planned_quantities
+        )
+
+    def read(self, x: Array) -> PlacedCarry:
+        """Evaluate a candidate at all points of the path.
+
+        Args:
+            x: (n_var,) decision vector.
+        """
+        cell, evaluator, grid = self._cell, self._cell.evaluator, self._cell.grid
+        found = {name: value[0] for name, value in evaluator.outputs(x[None]).items()}
+        waypoints = cell.waypoints(x)
+        extended = grid.basis @ waypoints
+        pose = np.ascontiguousarray(extended[:, :POSE_SIZE])
+        guesses = [grid.between(found[f"q_{arm}"]) for arm in (1, 2)]
+        if cell.task.redundant:
+            place_redundant(cell.task, extended, guesses)
+        posture = evaluator.functions["posture"].batch(pose, *guesses)
+        followed = np.column_stack(
+            [
+                (posture[f"residual_{arm}"].reshape(-1) <= REACH_TOLERANCE)
+                & (grid.between(found[f"lost_{arm}"].reshape(-1, 1))[:, 0] == 0.0)
+                for arm in (1, 2)
+            ]
+        )
+        lost = np.flatnonzero(~followed.all(axis=1))
+        reached = int(lost[0]) if len(lost) else len(followed)
+        q_1, q_2 = posture["q_1"], posture["q_2"]
+        rate = np.ascontiguousarray((grid.rate_basis @ waypoints)[:, :POSE_SIZE])
+        squares = [
+            1.0 + function.batch(pose, rate, q_1, q_2)["value"] for function in self._manipulability
+        ]
+        force = found["normal_force"]
+        minimised = force if cell.robust is None else cell.robust.forces(found)
+        held = pose[:reached], q_1[:reached], q_2[:reached]
+        gaps = lru_cache(maxsize=None)(partial(self._gaps, held[0]))
+        bounds = evaluator.checker.bounds(*held)
+        # Those of the payload from a box are raised to the largest gap.
+        near = bounds.min(axis=0, initial=np.inf) < SEPARATING_AXES_BELOW
+        for pair in cell.functions.separable.intersection(np.flatnonzero(near).tolist()):
+            np.maximum(bounds[:, pair], gaps(pair).max(axis=1), out=bounds[:, pair])
+        return PlacedCarry(
+            waypoints=waypoints,
+            pose=pose,
+            rate=rate,
+            q=(q_1, q_2),
+            reached=reached,
+            unreachable_arms=tuple(np.flatnonzero(~followed.all(axis=0)).tolist()),
+            manipulability=np.sqrt(np.maximum(np.column_stack(squares), 0.0))[:reached],
+            split=force if self._split_of is None else self._split_of(found),
+            force=minimised,
+            peak=minimised.max(axis=0) / cell.task.reference_force,
+            shift=found["pressure_shift"] / self._radii,
+            distances=Distances(bounds, evaluator.checker.measure, held),
+            gaps=gaps,
+        )
+
+    def _gaps(self, pose: Array, pair: int) -> Array:
+        """Compute the gaps between the payload and an obstacle box along several directions.
+
+        A gap is the distance between the projections of both bodies onto the direction, negative if
+        the projections overlap. The largest gap is a lower bound of the distance of the bodies.
+
+        Args:
+            pose: (n, 6) box poses [m, rad].
+            pair: index of the pair of payload and obstacle, one of `PolishFunctions.separable`.
+
+        Returns:
+            (n, SEPARATING_DIRECTIONS) gaps [m].
+        """
+        functions = self._cell.functions
+        return functions.built[GAPS].batch(pose, functions.obstacle(pair))["gaps"]

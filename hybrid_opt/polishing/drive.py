@@ -15,8 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.polishing.carry import CarryReader
-from hybrid_opt.polishing.cell import SmoothCell
+from hybrid_opt.polishing.cell import CarryReader, SmoothCell
 from hybrid_opt.polishing.constraints.active import RowSelector
 from hybrid_opt.polishing.intervals import (
     NEGLIGIBLE_MULTIPLIER,

@@ -23,8 +23,7 @@ from typing import Literal
 
 import numpy as np
 
-from hybrid_opt.polishing.carry import CarryReader, PlacedCarry
-from hybrid_opt.polishing.cell import SmoothCell
+from hybrid_opt.polishing.cell import CarryReader, PlacedCarry, SmoothCell
 from hybrid_opt.polishing.constraints.active import RowSelector
 from hybrid_opt.polishing.constraints.kinds import MinimisedForces
 from hybrid_opt.polishing.point import (

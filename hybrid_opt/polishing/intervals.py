@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from hybrid_opt.polishing.carry import PlacedCarry
-from hybrid_opt.polishing.cell import PolishFunctions, SmoothCell
+from hybrid_opt.polishing.cell import PlacedCarry, SmoothCell
+from hybrid_opt.polishing.functions import PolishFunctions
 from hybrid_opt.polishing.robust import ROBUST_ROWS, RobustForces
 from hybrid_opt.polishing.rows import ConstraintRows, Row, RowLayout
 from hybrid_opt.polishing.solvers.base import Residuals

@@ -22,8 +22,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from hybrid_opt.polishing.carry import CarryReader, PlacedCarry
-from hybrid_opt.polishing.cell import SmoothCell
+from hybrid_opt.polishing.cell import CarryReader, PlacedCarry, SmoothCell
 from hybrid_opt.polishing.constraints.active import RowSelector, WorkingSet
 from hybrid_opt.polishing.constraints.kinds import MinimisedForces
 from hybrid_opt.polishing.rows import PathRow, Row

@@ -11,12 +11,13 @@ import numpy as np
 from codegen.native import one_thread
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_PAIRS, FORCE_PAIRS, ROBUST_OBJECTIVES
-from hybrid_opt.polishing.cell import PolishFunctions, SmoothCell, polish_functions
+from hybrid_opt.polishing.cell import SmoothCell
 from hybrid_opt.polishing.drive import DriveStepMethod
 from hybrid_opt.polishing.drive_front import DriveRun
 from hybrid_opt.polishing.force import ForceSolver
 from hybrid_opt.polishing.force_front import ForceRun
 from hybrid_opt.polishing.front import ParetoArchive, PolishRun
+from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
 from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.timing.model import TimingModel

@@ -16,9 +16,11 @@ from functools import cache, partial
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from codegen.function import NumericFunction, PreparedBatch
-from hybrid_opt.polishing.cell import Indices, PolishFunctions, SmoothCell
+from hybrid_opt.polishing.cell import SmoothCell
+from hybrid_opt.polishing.functions import PolishFunctions
 from hybrid_opt.polishing.solvers.base import native
 from symbolic.array import Array
 from symbolic.records.task import POSE_SIZE
@@ -313,7 +315,7 @@ class ConstraintRows:
             "value": np.zeros(n),
         }
         groups, start = list[dict[str, Any]](), 0
-        needed: tuple[list[Indices], list[Indices]] = ([at[:0]], [at[:0]])
+        needed: tuple[list[NDArray[np.intp]], list[NDArray[np.intp]]] = ([at[:0]], [at[:0]])
         for own in members.values():
             stop = start + len(own)
             given = {name: array[start:stop] for name, array in shared.items()}

@@ -19,8 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_opt.polishing.carry import PlacedCarry
-from hybrid_opt.polishing.cell import SmoothCell
+from hybrid_opt.polishing.cell import PlacedCarry, SmoothCell
 from hybrid_opt.polishing.constraints.distances import (
     AxisSwitchGaps,
     Clearances,

@@ -17,8 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.polishing.carry import PlacedCarry, local_minima_below
-from hybrid_opt.polishing.cell import SmoothCell
+from hybrid_opt.polishing.cell import PlacedCarry, SmoothCell, local_minima_below
 from hybrid_opt.polishing.constraints.kinds import (
     PATCH_MARGIN,
     ConstraintKind,

@@ -12,8 +12,7 @@ from typing import Generic, TypeVar
 import numpy as np
 
 from codegen.function import NumericFunction
-from hybrid_opt.polishing.carry import PlacedCarry, local_minima_below
-from hybrid_opt.polishing.cell import SmoothCell
+from hybrid_opt.polishing.cell import PlacedCarry, SmoothCell, local_minima_below
 from hybrid_opt.polishing.rows import PROGRAM_BRANCH, ForceRow, PathRow, PressureRow, row_numbers
 from symbolic.array import Array
 from symbolic.contact.registry import contact_model

@@ -10,9 +10,10 @@ import numpy as np
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
-from hybrid_opt.polishing.cell import PolishFunctions, SmoothCell, polish_functions
+from hybrid_opt.polishing.cell import SmoothCell
 from hybrid_opt.polishing.drive import DriveStepMethod
 from hybrid_opt.polishing.drive_front import recheck_timing
+from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
 from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hybrid_opt.polishing.carry import PlacedCarry
+from hybrid_opt.polishing.cell import PlacedCarry
 from hybrid_opt.polishing.constraints.active import ACTIVE_ROW_LIFETIME, RowSelector, WorkingSet
 from hybrid_opt.polishing.constraints.distances import Gaps, edges, passing, separation
 from hybrid_opt.polishing.point import (

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.polishing.carry import CarryReader
+from hybrid_opt.polishing.cell import CarryReader
 from hybrid_opt.polishing.force import (
     ForceProgram,
     Scalarisation,

@@ -12,7 +12,7 @@ import hybrid_opt as ho
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
-from hybrid_opt.polishing.carry import CarryReader
+from hybrid_opt.polishing.cell import CarryReader
 from hybrid_opt.polishing.intervals import IntervalGrid, IntervalValues, PathTimingProgram
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.rows import PathRow, Row

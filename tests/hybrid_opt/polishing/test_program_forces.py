@@ -11,7 +11,7 @@ import pytest
 
 import hybrid_opt as ho
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
-from hybrid_opt.polishing.carry import CarryReader
+from hybrid_opt.polishing.cell import CarryReader
 from hybrid_opt.polishing.force import ForceProgram
 from hybrid_opt.polishing.rows import PROGRAM_BRANCH, ForceRow, Row
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings

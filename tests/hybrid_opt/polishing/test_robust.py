@@ -12,7 +12,7 @@ import pytest
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import ROBUST_DRIVABLE_OBJECTIVES, ROBUST_OBJECTIVES
-from hybrid_opt.polishing.carry import CarryReader
+from hybrid_opt.polishing.cell import CarryReader
 from hybrid_opt.polishing.force import ForceProgram, ForceSolver, balanced_scalarisation
 from hybrid_opt.polishing.intervals import IntervalGrid
 from hybrid_opt.polishing.polisher import Polisher

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -12,25 +10,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from codegen.cache import Cache
-from codegen.interpreted import InterpretedFunction
-from codegen.native import TapeFunction
-from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.polishing import cell as cell_module
-from hybrid_opt.polishing.carry import (
+from hybrid_opt.polishing.cell import (
+    POINT_SPACING,
     CarryReader,
     Distances,
+    Grid,
     interpolate_minima,
     local_minima_below,
 )
-from hybrid_opt.polishing.cell import POINT_SPACING, Grid, PolishFunctions
 from hybrid_opt.polishing.constraints.active import RowSelector
 from symbolic.array import Array
 from symbolic.records.task import initial_decision
-from symbolic.smooth.path_points import ORDERS, Clearance, PathPointSymbols, row_function
 from tests.hybrid_opt.polishing.cells import smooth_cell
 from tests.hybrid_opt.polishing.test_force_front import evaluator
-from tests.symbolic.cells import hand_cell, rack_cell
+from tests.symbolic.cells import hand_cell
 
 PLACES, PAIRS, LIMIT = 60, 4, 0.02
 
@@ -121,34 +114,6 @@ def test_the_dip_between_two_points_is_that_of_the_lines_from_both_sides() -> No
     assert np.all(low <= height)
     np.testing.assert_array_equal(low[:49], height[:49])
     np.testing.assert_array_equal(low[53:], height[53:])
-
-
-def test_a_row_made_on_demand_is_the_interpreted_one_and_is_kept(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    compiled = CompiledCell(rack_cell(), Cache(tmp_path))
-    made = PolishFunctions(compiled, {})
-    pair = next(k for k in range(99) if k not in made.separable)
-    row = Clearance(pair, int(compiled.geometry.columns[pair]))
-    again = PolishFunctions(CompiledCell(rack_cell(), Cache(tmp_path)), {})
-    symbols = PathPointSymbols(compiled.bodies)
-    rng = np.random.default_rng(0)
-    for order in ORDERS:
-        function = made.row(row, order)
-        expected = InterpretedFunction(row_function(symbols, row, order))
-        assert isinstance(function, TapeFunction)
-        assert made.row(row, order) is function
-        with monkeypatch.context() as patched:
-            patched.setattr(cell_module, "row_function", not_again)
-            assert again.row(row, order).signature == function.signature
-        inputs = [rng.uniform(-1.0, 1.0, (5, *shape)) for shape in function.input_shapes]
-        found, interpreted = function.batch(*inputs), expected.batch(*inputs)
-        for name in function.output_names:
-            np.testing.assert_allclose(found[name], interpreted[name], rtol=1e-9, atol=1e-9)
-
-
-def not_again(*_: Any) -> None:
-    raise AssertionError("its expression was built again")
 
 
 @pytest.mark.parametrize("samples", [20, 50, 100, 200, 400])
