@@ -100,8 +100,8 @@ class Scalarisation:
 
     @property
     def limits(self) -> MinimisedForces:
-        """For each robot, True if its peak force bounds the level a that is minimised; False if the
-        peak force only has a small weight, which decides between solutions with equal levels.
+        """For each robot, True if its peak force bounds the minimised level a (see the class);
+        False if it only has a small weight, which decides between solutions with equal levels.
         """
         first, second = (self.offset < UNBOUNDED_OFFSET).tolist()
         return first, second

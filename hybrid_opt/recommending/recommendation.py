@@ -353,11 +353,12 @@ def _driven(
 def _with_job(
     cell: Cell, paths: DrivenPaths, options: Sequence[Option], goal: Goal, force: float
 ) -> tuple[Option, Timing, CommandedForces] | None:
-    """Choose the carry to recommend among carries of less commanded force, which are slower, until
-    its job keeps all limits.
+    """Choose a carry whose job keeps all limits: try slower carries with less and less commanded
+    force.
 
-    Timings limit joint torques under the planned forces, jobs under the commanded ones. The excess
-    over the least commanded force of all carries is halved each time.
+    A job may exceed a limit that its carry's timing keeps, because timings limit joint torques
+    under the planned forces, jobs under the commanded ones. Each trial halves the excess of the
+    commanded force over the least one of all carries.
 
     Args:
         cell, paths, options, goal: as for `_driven`.
