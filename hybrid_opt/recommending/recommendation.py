@@ -23,7 +23,6 @@ from hybrid_opt.front import Front
 from hybrid_opt.job.compliance import separation
 from hybrid_opt.job.plan import CommandedForces, command_forces, job_model
 from hybrid_opt.job.records import Job
-from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.progress import ShowProgress, progress_bar
 from hybrid_opt.recommending.advice import Advice, advice, commanded_margins
 from hybrid_opt.recommending.choice import (
@@ -51,6 +50,7 @@ from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.robust.force import robust_model, subsample
 from hybrid_opt.robust.squeeze import MOST, Squeeze, largest_commanded
 from hybrid_opt.static_hold import static_hold
+from hybrid_opt.timing.jerk import driven_timing
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import Margin
 from symbolic.array import Array, Figure, evenly

@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.timing.limits import (
+from hybrid_opt.timing.model import REFINEMENT, PathMotion, SpeedProfile, TimingModel
+from hybrid_opt.timing.programs import (
     LINEARISED_ABOVE,
     PathLimits,
     duration_at_speed_limits,
     squared_speed_limit,
 )
-from hybrid_opt.timing.model import REFINEMENT, PathMotion, SpeedProfile, TimingModel
 from hybrid_opt.timing.records import (
     FRICTION_RATIO,
     PathTiming,

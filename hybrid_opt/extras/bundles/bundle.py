@@ -35,9 +35,9 @@ from hybrid_opt.job.compliance import (
 )
 from hybrid_opt.job.plan import plan_job
 from hybrid_opt.job.records import Job, sample_job
-from hybrid_opt.job.smooth import RESTS, acceleration_at_ends
 from hybrid_opt.store.bundle_file import MANIFEST, write_bundle
 from hybrid_opt.store.files import own_version, sha256
+from hybrid_opt.timing.jerk import RESTS, acceleration_at_ends
 from hybrid_opt.timing.records import Timing
 from symbolic.contact.registry import contact_model
 from symbolic.errors import SettingsError

@@ -18,9 +18,9 @@ from hybrid_opt.extras.bundles import TARGETS, BundleOptions, export
 from hybrid_opt.extras.bundles.bundle import prepared
 from hybrid_opt.extras.bundles.targets import target_for
 from hybrid_opt.job.plan import JobModel
-from hybrid_opt.job.smooth import driven_timing, without_jumps
 from hybrid_opt.robust.force import subsample
 from hybrid_opt.robust.squeeze import largest_commanded
+from hybrid_opt.timing.jerk import driven_timing, without_jumps
 from hybrid_opt.timing.records import JerkLimits
 from symbolic.errors import SettingsError
 from tests.hybrid_opt.cells import shipped
