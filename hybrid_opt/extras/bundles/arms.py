@@ -114,7 +114,12 @@ class Lines:
     meaning: str
 
     def require(self, workcell: Workcell, target: str) -> None:
-        """Refuse a cell whose hands have other names of outputs or, where stated, of inputs."""
+        """Check that a target can reach the hands of a cell by the names of their outputs and,
+        where stated, of their inputs.
+
+        Raises:
+            SettingsError: a name is not allowed; the message states the key and the allowed names.
+        """
         for robot in workcell.robots:
             driver = robot.driver
             known = [("grip_output", self.output, driver.grip_output)]
@@ -137,16 +142,18 @@ def plan_of(
     stiffness: float | None,
     presses: bool,
 ) -> dict[str, Any]:
-    """Return what a bundle was planned for, as JSON values, for its program to compare with what it
-    measures: stiffness of each arm at its pad [N/m] or None, and the drivers.
+    """Return the planned values of a bundle as JSON values: driver settings, stiffness and leads.
+    The bundle's bring-up program compares them with measured values.
 
     Args:
         workcell: the cell.
         target: name of the target.
         program: name of the program that runs the job.
-        leads: how far each arm's commands are sent ahead of its delay [s].
+        leads: for each arm, the part of its delay that the program compensates by sending commands
+            ahead [s].
         stiffness: stiffness of each arm at its pad [N/m]; None if the job does not depend on it.
-        presses: True if the bring-up presses a block and measures the force by the arms' sensors.
+        presses: True if the bring-up program presses a block and measures the force by the arms'
+            sensors.
     """
     drivers = [vars(robot.driver).items() for robot in workcell.robots]
     return {

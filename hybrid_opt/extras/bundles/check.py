@@ -355,16 +355,19 @@ def check(
 
 
 def _places(time: Array) -> Array:
-    """Return ascending times [s]: those of samples (n,) and, in each step between two of them,
-    those at the shares `BETWEEN` of the step."""
+    """Return ascending times [s]: those of the n samples, and in each step between two samples the
+    times at the shares `BETWEEN` of the step.
+    """
     steps = np.diff(time)
     inside = [time[:-1] + share * steps for share in (0.0, *BETWEEN)]
     return np.append(np.column_stack(inside).ravel(), time[-1])
 
 
 def _load(cell: Cell) -> NumericFunction:
-    """Return the compiled function from pose, velocity and acceleration of the box to its contact
-    forces. A timing model has it, too, but would also load a compiled solver."""
+    """Return the compiled function that computes the contact forces from pose, velocity and
+    acceleration of the box. A timing model has this function too, but would also load a compiled
+    solver.
+    """
 
     def make(model: CellModel) -> Mapping[str, ca.Function]:
         from symbolic.contact.load import load_function
@@ -375,9 +378,12 @@ def _load(cell: Cell) -> NumericFunction:
 
 
 def _certificate(cell: Cell, joints: BPoly, time: Array) -> str:
-    """Prove that the motion of both arms and box, by the polynomials of the joint positions, is
-    free of collisions between the first and the last time (n,) [s]. Return the first colliding pair
-    and its time as text; '' if the motion is proven free."""
+    """Prove that the motion of both arms and box is free of collisions from the first to the last
+    of the times (n,) [s]. `joints` are polynomials of both arms' joint positions.
+
+    Returns:
+        The first colliding pair and its time as text; '' if the motion is proven free.
+    """
     workcell = cell.workcell
 
     def at(places: Array) -> tuple[Array, Array, Array]:
@@ -394,9 +400,12 @@ def _certificate(cell: Cell, joints: BPoly, time: Array) -> str:
 
 
 def _held(along: Array, across: Array) -> Mask:
-    """Return (n,) True for the longest run of samples at which both pads are near their planned
-    positions relative to each other, of at least `SHORTEST`; False everywhere if there is none.
-    `along` and `across` are those of `pad_errors`."""
+    """Find the longest run of at least `SHORTEST` samples at which both pads are near their planned
+    positions relative to each other. `along` and `across` are the results of `pad_errors`.
+
+    Returns:
+        (n,) True for samples of this run; False everywhere if there is none.
+    """
     near = (np.abs(along) < TOUCHING) & (across < TOUCHING)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], near.astype(int), [0]])))
     runs = list(zip(edges[::2], edges[1::2], strict=True))

@@ -107,7 +107,9 @@ def recording(export: Export) -> dict[str, str | bytes]:
 
 
 def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, str, Any]]:
-    """Yield time [ns], topic and message of every sample, with ROS message classes by name."""
+    """Yield time [ns], topic and message of every sample. `types` has the ROS message classes by
+    name.
+    """
     sampled, cell, joined = export.sampled, export.workcell, prefixes(export.workcell)
     joints = ros_joints(cell)
     places = list(joints.values())

@@ -41,8 +41,13 @@ UNKNOWN_TOOL_MASS = 0.1
 
 
 def require_egm(workcell: Workcell, leader: int) -> None:
-    """Refuse a cell whose force-controlled arm, the one that does not lead, has no force control on
-    its controller, or that does not state the delay of each arm."""
+    """Check that a cell states the delay of each arm, and that the controller of its
+    force-controlled arm has force control.
+
+    Args:
+        workcell: the cell.
+        leader: index of the position-controlled arm.
+    """
     robots = workcell.robots
     robot, other = robots[1 - leader], robots[leader]
     if not robot.driver.force_control:

@@ -85,8 +85,11 @@ class Gap:
 def chosen_step(
     job: Job, steps: Sequence[float], interpolation: Interpolation, stiffness: float
 ) -> float:
-    """Return the longest time step [s] for which the normal forces between samples miss the least
-    commanded one by at most the share `TRACKED`, because the distance of the pads changes there.
+    """Return the longest time step [s] with which the normal forces stay near the commanded ones
+    between samples.
+
+    Between two samples the distance of the pads changes, and with it the normal forces. A step is
+    accepted if this error is at most the share `TRACKED` of the least commanded force.
 
     Raises:
         SettingsError: the error is too large with every step.
@@ -142,9 +145,15 @@ def between(time: Array, known: Sequence[Array], interpolation: Interpolation) -
 
 
 def pad_errors(workcell: Workcell, q: Array) -> tuple[Array, Array]:
-    """Compute how far the second pad is from its planned position relative to the first pad: (n,)
-    their distance along the first pad's normal less the planned one, and (n,) how far they are
-    apart across this normal [m], of joint positions q (n, joints) of both arms side by side."""
+    """Compute how far the second pad is from its planned position relative to the first pad.
+
+    Args:
+        q: (n, joints) joint positions of both arms side by side [rad or m].
+
+    Returns:
+        Distance (n,) between the pads along the first pad's normal, minus the planned distance [m];
+        and displacement (n,) across this normal, at least zero [m].
+    """
     T = [pad_places(workcell, arm, own) for arm, own in enumerate(joints_of(workcell, q))]
     apart = np.einsum("nji,nj->ni", T[0][:, :3, :3], T[1][:, :3, 3] - T[0][:, :3, 3])
     one, other = (contact.T_box_pad for contact in workcell.contacts)
@@ -153,8 +162,9 @@ def pad_errors(workcell: Workcell, q: Array) -> tuple[Array, Array]:
 
 
 def pad_places(workcell: Workcell, arm: int, q: Array) -> Array:
-    """Compute the poses (n, 4, 4) of an arm's pad in the world, of the arm's joint positions q
-    (n, n_joints) [rad or m]."""
+    """Compute the poses (n, 4, 4) of an arm's pad in the world at joint positions q (n, n_joints)
+    of this arm [rad or m].
+    """
     robot = workcell.robots[arm]
     model = build_robot_model(robot)
     data, found = model.model.createData(), np.empty((len(q), 4, 4))
@@ -334,7 +344,9 @@ class Export:
     @property
     def joint_columns(self) -> dict[str, Array]:
         """Arrays (n, joints) of both arms side by side, by name: joint positions [rad or m],
-        velocities, accelerations, and torques with and without gravity [N m, or N]."""
+        velocities and accelerations [per s, per s^2], and torques with and without gravity [N m,
+        for sliding joints N].
+        """
         sampled = self.sampled
         return {
             "position": sampled.q,
@@ -394,8 +406,9 @@ class Export:
         return found
 
     def reach(self, arm: int) -> Array:
-        """Compute the largest speed of an arm's pad per speed of each of its joints (n_joints,),
-        over all samples [m/rad, for sliding joints 1]."""
+        """Compute for each joint of an arm the largest speed of the pad per speed of this joint,
+        over all samples: (n_joints,) [m/rad, for sliding joints 1].
+        """
         J = pad_jacobians(self.workcell, arm, self.sampled.arm(arm, self.sampled.q))
         return np.asarray(np.linalg.norm(J[:, :3], axis=1).max(axis=0))
 

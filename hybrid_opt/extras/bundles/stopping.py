@@ -66,8 +66,10 @@ def stop_of(job: Job, model: TimingModel) -> Stop:
     places, x = time[::STOP_STRIDE], np.linspace(0.0, 1.0, INSTANTS)
 
     def stop(duration: float) -> Stop:
-        """Simulate stops of a duration [s] that begin at many points of the path, for the largest
-        normal force and joint acceleration, as shares of the commanded force and of the limit."""
+        """Simulate stops of a given duration [s] that begin at many points of the path. Return the
+        largest normal force and joint acceleration of all these stops, as shares of the commanded
+        force and of the limit.
+        """
         rate = 1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
         slope = -30.0 * x**2 * (1.0 - x) ** 2 / duration
         passed = duration * (x - 2.5 * x**4 + 3.0 * x**5 - x**6)

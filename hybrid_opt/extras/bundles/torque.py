@@ -113,8 +113,9 @@ def driver_of(workcell: Workcell) -> str:
 
 
 def require_torque(job: Job) -> None:
-    """Refuse Franka arms whose joints have other names than in franka_ros2, or whose prefix does
-    not end with '_'."""
+    """Check, for Franka arms, that the joints have the names that franka_ros2 uses, and that
+    prefixes end with '_'.
+    """
     if driver_of(job.workcell) != "franka":
         return
     for robot, joints in zip(job.workcell.robots, job.joint_names, strict=True):
@@ -204,9 +205,11 @@ def torque_files(export: Export) -> dict[str, str | bytes]:
 def _grip(export: Export, arm: int) -> dict[str, Any]:
     """Describe how the hands of an arm are switched and watched in ROS.
 
-    `name` and `kind` are of the service that switches the hands, `on` and `off` the fields of its
-    requests. `input` has the `topic`, its message type `kind` and the `pin` with which the hands
-    report that they hold; it is None if they report nothing.
+    Returns:
+        A dictionary. `name` and `kind` are name and type of the service that switches the hands,
+        `on` and `off` the fields of the two requests. `input` has the `topic`, its message type
+        `kind` and the `pin` with which the hands report that they hold; it is None if they report
+        nothing.
     """
     driver = export.workcell.robots[arm].driver
     io = f"/{_values(export, arm)['space']}/io_and_status_controller"

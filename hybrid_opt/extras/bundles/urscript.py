@@ -47,7 +47,11 @@ gives this limit to force_mode."""
 
 
 def require_followed(job: Job) -> None:
-    """Refuse a carry whose pressing pad moves along its normal faster than force mode follows."""
+    """Check that URScript's force mode can follow the motion of the pressing pad along its normal.
+
+    Raises:
+        SettingsError: the carry is too fast; the message states the speed and remedies.
+    """
     if job.follower is None:
         return
     speeds = [normal_speed(job, arm) for arm in (0, 1)]

@@ -219,9 +219,16 @@ class Looks:
         return median(found) if found else nan
 
     def contact(self, arm: int, lag: float) -> dict[str, float]:
-        """Evaluate the readings of an arm's force sensor while a block was pressed by an arm with a
-        delay `lag` [s]. Return `sign`, and `stiffness` if the displacement of the pad is known,
-        else `press`, as in `Measured`; raise a `Refused` if no force was measured."""
+        """Evaluate the readings of an arm's force sensor while a block was pressed. `lag` is the
+        arm's delay behind its commands [s].
+
+        Returns:
+            Values of `Measured` by name: `sign`; and `stiffness` if the displacement of the pad is
+            known, else `press`.
+
+        Raises:
+            Refused: no force was measured.
+        """
         readings = [(t, way, wanted, raw[arm]) for t, way, wanted, raw in self.pressed]
         known = [(*rest, raw - self.offset(arm)) for *rest, raw in readings if raw is not None]
         most = max((row[2] for row in known), default=0.0)

@@ -219,8 +219,9 @@ class Job:
         return found
 
     def linear(self, arm: int, name: str, s: float) -> list[float]:
-        """Interpolate values of an arm linearly between samples, by their name in its part of the
-        document and in the unit of the document."""
+        """Interpolate values of an arm linearly between samples. `name` is their key in the arm's
+        part of the document, which also decides their unit.
+        """
         k, x, _ = self._place(s)
         rows = self.robots[arm][name]
         return [(1.0 - x) * a + x * b for a, b in zip(rows[k], rows[k + 1], strict=True)]
@@ -232,19 +233,23 @@ class Job:
         return float((1.0 - x) * rows[k] + x * rows[k + 1])
 
     def effort(self, arm: int, gravity: str, s: float, rate: float) -> list[float]:
-        """Return the joint torques of an arm at a planned time [N m, for sliding joints N].
+        """Return the joint torques of an arm at a planned time, adapted to the rate at which the
+        job runs [N m, for sliding joints N].
 
         Args:
-            gravity: 'with_gravity' or 'without_gravity', the arm's weight.
-            rate: of the planned time; 1 at the planned speed, 0 at rest.
+            gravity: 'with_gravity' or 'without_gravity': whether the torques include the arm's
+                weight.
+            rate: derivative of the planned time with respect to time; 1 at the planned speed, 0 at
+                rest.
         """
         moving = self.linear(arm, f"effort_{gravity}", s)
         holding = self.linear(arm, f"hold_effort_{gravity}", s)
         return [b + (a - b) * rate * rate for a, b in zip(moving, holding, strict=True)]
 
     def distance(self, arm: int, q: Sequence[float], s: float) -> float:
-        """Return an upper bound of the distance between an arm's pad, at the joint positions `q`,
-        and its planned position at the time s [m]."""
+        """Return an upper bound of the distance [m] of an arm's pad at joint positions q from its
+        planned position at the planned time s.
+        """
         reach = self.robots[arm]["reach"]
         planned = self.position(arm, s)
         return float(sum(r * abs(a - b) for r, a, b in zip(reach, q, planned, strict=True)))

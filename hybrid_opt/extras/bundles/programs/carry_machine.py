@@ -65,8 +65,9 @@ class Clock:
     """
 
     def __init__(self, end: float, stop_time: float, s: float = 0.0, rate: float = 0.0) -> None:
-        """Start the clock at the planned time s of a path that ends at the planned time `end`; in
-        `stop_time` the rate changes by 1 [s]."""
+        """Start the clock at the planned time s of a path that ends at the planned time `end` [s].
+        `stop_time` is the duration in which the rate changes by 1 [s].
+        """
         self.s, self.rate, self._stop_time = s, rate, stop_time
         self._low, self._high, self._takes = 0.0, end, stop_time
         self._from, self._to, self._since = rate, rate, 0.0
@@ -77,14 +78,17 @@ class Clock:
 
     @property
     def turning(self) -> bool:
-        """True while the rate changes."""
+        """True while the rate changes; the rate is the derivative of the planned time with respect
+        to time.
+        """
         return self._from != self._to
 
     def turn(self, rate: float, after: float = 0.0, takes: float | None = None) -> None:
-        """Start a smooth change to a rate.
+        """Start a smooth change of the rate, the derivative of the planned time with respect to
+        time.
 
         Args:
-            rate: 1 for the planned speed, 0 for rest, -1 for backwards.
+            rate: rate after the change: 1 for the planned speed, 0 for rest, -1 for backwards.
             after: time until the change begins [s].
             takes: duration of a change of the rate by 1 [s]; None for the stop time of the clock.
         """
@@ -240,7 +244,7 @@ class Machine:
         self.state, self.reason = "held", reason
 
     def resume(self, direction: float, seen: Seen) -> None:
-        """Continue a job that is held: 1 runs to its end, -1 back to its beginning.
+        """Continue a job that is held, in the direction 1 to its end or -1 back to its beginning.
 
         Raises:
             Refused: the job is not held, or an arm is silent or not where it is held.
@@ -263,8 +267,9 @@ class Machine:
         return self.job.grips(self.clock.s, self._direction)
 
     def _aim(self, direction: float) -> None:
-        """List the points of the path ahead, 1 forward or -1 back, at which the clock has to wait
-        until inputs report the state of hands, and limit the clock to the first."""
+        """List the points of the path ahead at which the clock has to wait until inputs report the
+        state of hands, and limit the clock to the first. `direction` is 1 forward, -1 back.
+        """
         self._direction, s, found = direction, self.clock.s, self.job.switches
         gates = [switch.end for switch in found if switch.end >= s]
         if direction < 0.0:
@@ -336,8 +341,12 @@ class Machine:
                 self.hold(str(error))
 
     def _lands(self, force: str) -> bool:
-        """Begin to stop the arms if a wrong force may mean that the box stands on its support, and
-        if they come to rest before the release. Return True if the box may stand, in any case."""
+        """Begin to stop the arms if a wrong force may mean that the box stands on its support. No
+        stop begins if the release would begin before the arms are at rest.
+
+        Returns:
+            True if the box may stand, whether or not a stop begins.
+        """
         if not self.job.is_touching(self.clock.s):
             return False
         # Slow arms can stop sooner, and press less until then.
@@ -391,8 +400,16 @@ class Machine:
         return str(self.job.robots[arm]["name"])
 
     def _require_places(self, seen: Seen, most: float, slack: float = 0.0) -> None:
-        """Refuse arms that are silent, or whose pads are farther than `most` [m] from where the job
-        stands, give or take a planned time `slack` [s]."""
+        """Check that both arms report their state, and that they are at the present point of the
+        path.
+
+        Args:
+            most: largest distance of a pad from its path [m].
+            slack: planned time by which an arm may be ahead or behind on its path [s].
+
+        Raises:
+            Refused: an arm is silent or elsewhere.
+        """
         s = self.clock.s
         for arm, q in enumerate(seen.q):
             if q is None or seen.age[arm] > self.job.limits.silence:

@@ -55,8 +55,9 @@ class Carry:
     machine: Machine
 
     def __init__(self, known: Sequence[Measured] | Looks, log: Any) -> None:
-        """Begin without a job. What is known of the arms are their measured properties, or a store
-        of measurements if they are to be measured."""
+        """Begin without a job. `known` holds the measured properties of both arms, or is a store of
+        measurements if the arms are to be measured.
+        """
         self.looks = known if isinstance(known, Looks) else None
         self.signs = None if isinstance(known, Looks) else [each.sign for each in known]
         self.fault, self.lost, self.command, self.log = "", False, "", log

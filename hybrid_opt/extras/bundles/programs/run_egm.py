@@ -278,8 +278,10 @@ class Stream(Carry):
         return to_robot(number, now, *self._as_abb(arm, [math.degrees(value) for value in q]))
 
     def _inward(self, s: float) -> list[float]:
-        """Interpolate how far each joint of the pressing arm turns per metre by which its pad moves
-        into the box along the contact normal [rad/m]."""
+        """Compute how far each joint of the pressing arm turns per metre by which its pad moves
+        into the box, along the contact normal [rad/m]; interpolated linearly between the samples of
+        the job.
+        """
         rows, time = self.config["inward"], self.job.time
         k = min(max(bisect_left(time, s) - 1, 0), len(rows) - 2)
         share = min(max((s - time[k]) / (time[k + 1] - time[k]), 0.0), 1.0)
@@ -366,8 +368,9 @@ def to_robot(number: int, time: float, joints: Sequence[float], further: Sequenc
 
 
 def _inside(data: bytes, *path: int) -> bytes:
-    """Return what a protobuf message has at a path of fields, the number of each given. Several
-    values of a field are joined, by which protobuf merges messages."""
+    """Return the content of a field of a protobuf message that lies at a path of field numbers.
+    Several values of the field are joined, since protobuf merges messages in this way.
+    """
     for number in path:
         parts = (value for field, value in _fields(data) if field == number)
         data = b"".join(value for value in parts if isinstance(value, bytes))
