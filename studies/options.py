@@ -244,7 +244,7 @@ def check_paths(parser: argparse.ArgumentParser, options: argparse.Namespace) ->
 EXTRAS = {
     "dask": ("distributed",),
     "live": ("viser",),
-    "propose": ("cma", "ompl"),
+    "propose": ("cma",),
     "ros": ("mcap", "rosbags"),
     "sim": ("mujoco",),
     "video": ("imageio_ffmpeg",),

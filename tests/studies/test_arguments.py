@@ -105,7 +105,7 @@ def test_a_wrong_place_is_refused_before_anything_heavy_is_imported(
     ("line", "module"),
     [
         ("live cell", "viser"),
-        ("propose problem", "ompl"),
+        ("propose problem", "cma"),
         ("simulate carry.json", "mujoco"),
         ("run cell --simulate", "mujoco"),
         ("run cell --executor dask", "distributed"),

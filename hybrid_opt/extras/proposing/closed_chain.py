@@ -23,6 +23,7 @@ from hybrid_opt.extras.proposing.kinematics import (
     compiled_newton,
 )
 from hybrid_opt.extras.proposing.static_load import MOST_TORQUE, StaticLoad
+from hybrid_opt.extras.proposing.trees import inner_points
 from hybrid_opt.extras.proposing.trial import PoseJudge
 from symbolic.array import Array
 from symbolic.records import POSE_SIZE, Workcell
@@ -75,7 +76,7 @@ class _Follower:
         start, goal = waypoints[0].lower, waypoints[-1].lower
         self.name, self.many = robot.name, many
         self.names = list(model.names)[1:]
-        self.redundant = many.workcell.task.redundant_entries[many.arm]
+        self.redundant = many.workcell.task.redundant_places[many.arm]
         self.T_box_joint = many.held(hold.spin)
         key = f"robots[{many.arm}].min_manipulability = {robot.min_manipulability:g} m^3"
         self.singular = f"{robot.name} is near a singular posture ({key})"
@@ -107,7 +108,7 @@ class _Follower:
             q,
             T_world_box @ self.T_box_joint,
             joints,
-            extended[:, [entry for _, entry in self.redundant]],
+            extended[:, [place for _, place in self.redundant]],
             CHAIN_NEWTON_STEPS,
             CHAIN_RESIDUAL,
             JUMP,
@@ -204,8 +205,8 @@ class ClosedChain:
         closed, found = np.ones(len(extended), dtype=bool), []
         for arm, near in zip(self._arms, q, strict=True):
             guess = near.copy()
-            for joint, entry in arm.redundant:
-                guess[:, joint] = extended[:, entry]
+            for joint, place in arm.redundant:
+                guess[:, joint] = extended[:, place]
             there = arm.many.solve(guess, T_world_box @ arm.T_box_joint, steps)
             closed &= there.residual <= REACHED
             closed &= arm.side * there.determinant >= arm.many.least
@@ -288,6 +289,57 @@ class ClosedChain:
         ]
         free = self._free(configurations[1:-1]) == len(configurations) - 2
         return [first, *configurations[1:-1], last] if free else None
+
+    def reach_many(
+        self, begins: Sequence[ChainConfiguration], ends: Array
+    ) -> list[ChainConfiguration | None]:
+        """Return the configurations at the ends of k straight motions; None for motions that are
+        not free of collisions or that an arm cannot follow.
+
+        The ends are checked first, then the middles, then all other points.
+
+        Args:
+            begins: configuration at the beginning of each motion.
+            ends: (k, 6 + m) box pose at its end [m, rad] followed by the m redundant joints [rad or
+                m].
+        """
+        first = np.array([begin.extended for begin in begins])
+        q_first = np.array([np.concatenate(begin.q) for begin in begins])
+        q_last, fine = self._held(ends, q_first)
+        lengths = np.linalg.norm(metric_weights(ends.shape[1]) * (ends - first), axis=1)
+        counts = np.maximum(np.ceil(lengths / PATH_STEP), 1).astype(np.intp)
+        for which, share in inner_points(counts):
+            asked = fine[which]
+            which, u = which[asked], share[asked, None]
+            near = q_first[which] + u * (q_last[which] - q_first[which])
+            q, free = self._held(first[which] + u * (ends[which] - first[which]), near)
+            free &= np.abs(q - near).max(axis=1, initial=0.0) <= JUMP
+            fine[which[~free]] = False
+        joints = self._arms[0].many.geometry.joints
+        return [
+            ChainConfiguration(end, (q[:joints], q[joints:])) if free else None
+            for end, q, free in zip(ends, q_last, fine.tolist(), strict=True)
+        ]
+
+    def _held(self, extended: Array, near: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """Find the joint positions with which both arms hold the box at n poses, and check them for
+        collisions.
+
+        Args:
+            extended: (n, 6 + m) box poses [m, rad] followed by the m redundant joints [rad or m].
+            near: (n, joints) joint positions of both arms, side by side, from which the solution
+                starts [rad or m].
+
+        Returns:
+            Joint positions (n, joints) of both arms, side by side; and (n,) True where both arms
+            hold the box without collision.
+        """
+        first, second = np.split(near, [self._arms[0].many.geometry.joints], axis=1)
+        q, fine = self.close_many(extended, (first, second), CHAIN_NEWTON_STEPS)
+        self.looked += len(extended)
+        rows = np.flatnonzero(fine)
+        fine[rows] = ~self.blocked(extended[rows, :POSE_SIZE], (q[0][rows], q[1][rows]))
+        return np.hstack(q), fine
 
     def reach(self, begin: ChainConfiguration, extended: Array) -> ChainConfiguration | None:
         """Return the configuration at the end of a straight motion; None if the motion is not free

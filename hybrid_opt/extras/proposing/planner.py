@@ -1,10 +1,10 @@
 """A collision-free path of the box with both arms, over the closed chain.
 
-First straight motions are tried: out of the start, across, into the goal. If none is free,
-RRT-Connect of OMPL (Kuffner and LaValle, ICRA 2000) searches among all poses, from every pose that
-straight motions out of start and goal reach. Both move in the coordinates of the box path, which
-the later spline has too, and not in joint coordinates. The joints of both arms follow and stay on
-their branches; they are stored with every pose. This is the only module that needs OMPL.
+First straight motions are tried: out of the start, across, into the goal. If none is free, trees
+of straight motions (`trees.py`) grow from every pose that straight motions out of start and goal
+reach. Both move in the coordinates of the box path, which the later spline has too, and not in
+joint coordinates. The joints of both arms follow and stay on their branches; they are stored with
+every pose.
 """
 
 from __future__ import annotations
@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise, permutations, product
-from typing import Any
 
 import numpy as np
 
@@ -24,9 +23,9 @@ from hybrid_opt.extras.proposing.closed_chain import (
     distance,
     metric_weights,
 )
+from hybrid_opt.extras.proposing.trees import connect
 from hybrid_opt.extras.proposing.trial import PayloadSceneChecker
 from symbolic.array import Array
-from symbolic.errors import SettingsError
 from symbolic.records import POSE_SIZE
 
 RETREAT = 0.6
@@ -64,7 +63,7 @@ class AffineSubspace:
         directions: (6 + m, d) basis. Its scale makes the Euclidean distance between two coordinates
             equal to the `distance` of their vectors.
         lower, upper: (d,) bounds of y [m].
-        range: longest motion by which the planner's trees grow [m].
+        range: longest motion by which trees grow [m].
     """
 
     origin: Array
@@ -98,7 +97,7 @@ class Corridor:
     Attributes:
         tilt: largest rotation of the box away from the straight interpolation between the angles of
             start and goal [rad]; 0 allows none.
-        range: longest motion by which the planner's trees grow [m].
+        range: longest motion by which trees grow [m].
         aside: largest distance of the box beyond start and goal along each axis of the world [m].
         towards: -1, 0 or 1 for each axis of the world: the direction in which the box may leave the
             range between start and goal; None for all directions.
@@ -229,65 +228,44 @@ def plan(
     *,
     most: int,
     out_of_time: Callable[[], bool],
-    seed: int,
+    rng: np.random.Generator,
 ) -> list[ChainConfiguration] | None:
-    """Find a collision-free path from start to goal by the planner RRT-Connect; None if no path is
-    found.
+    """Find a collision-free path from start to goal by trees that grow; None if no path is found.
 
     Args:
         chain: both arms, whose pads stay fixed on the box.
         out: result of `retreats`: configurations along straight motions out of start and goal. They
-            become further roots of the planner's trees.
+            become further roots of the trees.
         room: box poses and redundant joints that the path may use.
-        most: largest number of configurations that may be checked.
+        most: number of checked configurations after which the search ends.
         out_of_time: function that returns True if no time is left.
-        seed: seed of the planner, at least 1.
+        rng: generator of random poses.
 
     Returns:
         Configurations at the corners of the path; between them the box moves straight.
-
-    Raises:
-        SettingsError: OMPL is not installed.
     """
-    known: dict[State, ChainConfiguration] = {}
-    ways: dict[State, ChainConfiguration] = {}
-    ends: tuple[list[State], list[State]] = ([], [])
-    for states, ways_out in zip(ends, out, strict=True):
-        end = ways_out[0][0]
-        for stop in (end, *_usable([way[-1] for way in ways_out], end, room)):
-            state: State = tuple(room.coordinates(stop.extended).tolist())
-            known[state], ways[state] = stop, end
-            states.append(state)
-
-    def joined(first: State, second: State) -> bool:
-        """Return True if the straight motion between two coordinates is free of collisions.
-
-        The arms are followed from the coordinate whose joint positions are known; those at the
-        other one are stored. If they are known at neither coordinate, the result is False.
-
-        Args:
-            first: (d,) coordinate in `room`.
-            second: (d,) another coordinate.
-        """
-        if first not in known:
-            first, second = second, first
-        if first not in known:
-            return False
-        found = chain.reach(known[first], room.extended(np.array(second)))
-        return found is not None and same(known.setdefault(second, found), found)
-
-    last = chain.looked + most
-    path = connected(
-        (room.lower, room.upper),
-        room.range,
-        joined,
-        ends,
-        lambda: chain.looked >= last or out_of_time(),
-        seed,
+    roots = [[ways[0][0], *_usable([way[-1] for way in ways], ways[0][0], room)] for ways in out]
+    first, last = (
+        (np.array([room.coordinates(stop.extended) for stop in stops]), stops) for stops in roots
     )
-    if path is None or any(state not in known for state in path):
+
+    def join(
+        begins: Sequence[ChainConfiguration], points: Array
+    ) -> list[ChainConfiguration | None]:
+        return chain.reach_many(begins, room.origin + points @ room.directions.T)
+
+    until = chain.looked + most
+    path = connect(
+        (first, last),
+        room.range,
+        lambda count: rng.uniform(room.lower, room.upper, (count, len(room.lower))),
+        join,
+        same,
+        lambda: chain.looked >= until or out_of_time(),
+    )
+    if path is None:
         return None
-    found = [ways[path[0]], *(known[state] for state in path), ways[path[-1]]]
+    found = [roots[0][0], *path, roots[1][0]]
     return [each for k, each in enumerate(found) if k == 0 or each is not found[k - 1]]
 
 
@@ -323,78 +301,3 @@ def same(first: ChainConfiguration, second: ChainConfiguration) -> bool:
     """
     apart = [np.abs(a - b).max() for a, b in zip(first.q, second.q, strict=True)]
     return bool(max(apart) < MATCH)
-
-
-State = tuple[float, ...]
-"""Coordinates in which the planner moves."""
-
-
-def connected(
-    bounds: tuple[Array, Array],
-    longest: float,
-    joined: Callable[[State, State], bool],
-    ends: Sequence[Sequence[State]],
-    ended: Callable[[], bool],
-    seed: int,
-) -> list[State] | None:
-    """Find the corners of a path between two sets of states by the planner RRT-Connect; None if no
-    path is found.
-
-    Args:
-        bounds: lower and upper bounds (d,) of the states; a state is a point with d coordinates.
-        longest: longest motion by which the planner's trees grow, in the unit of the states.
-        joined: function that returns True if the straight motion between two states is free.
-        ends: states (d,) at which the path may begin, and states at which it may end.
-        ended: function that returns True if the search has to end.
-        seed: seed of the planner, at least 1.
-
-    Raises:
-        SettingsError: OMPL is not installed.
-    """
-    try:
-        from ompl import base, geometric, util
-    except ImportError as error:
-        raise SettingsError(
-            "a first path is planned by OMPL, which is not installed: "
-            'pip install "dual-arm-carry[propose]"'
-        ) from error
-    util.setLogLevel(util.LogLevel.LOG_NONE)  # also says that seeds were drawn before
-    util.RNG.setSeed(seed)
-    size = len(bounds[0])
-
-    def values(state: Any) -> State:
-        return tuple(state[k] for k in range(size))
-
-    class Validator(base.MotionValidator):  # type: ignore[misc]
-        """OMPL's validator of motions, which calls `joined`."""
-
-        def checkMotion(self, first: Any, second: Any) -> bool:
-            return joined(values(first), values(second))
-
-    space, limits = base.RealVectorStateSpace(size), base.RealVectorBounds(size)
-    for k, (low, high) in enumerate(zip(*bounds, strict=True)):
-        limits.setLow(k, float(low))
-        limits.setHigh(k, float(high))
-    space.setBounds(limits)
-    information = base.SpaceInformation(space)
-    information.setStateValidityChecker(lambda state: True)
-    asked = Validator(information)
-    information.setMotionValidator(asked)
-    information.setup()
-    problem, goals = base.ProblemDefinition(information), base.GoalStates(information)
-    for states, add in zip(ends, (problem.addStartState, goals.addState), strict=True):
-        for known in states:
-            state = space.allocState()
-            for k, value in enumerate(known):
-                state[k] = value
-            add(state)
-    problem.setGoal(goals)
-    planner = geometric.RRTConnect(information)
-    planner.setRange(longest)
-    planner.setProblemDefinition(problem)
-    planner.setup()
-    planner.solve(base.PlannerTerminationCondition(ended))
-    if not problem.hasExactSolution():
-        return None
-    path = problem.getSolutionPath()
-    return [values(path.getState(k)) for k in range(path.getStateCount())]

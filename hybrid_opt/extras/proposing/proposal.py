@@ -51,7 +51,7 @@ from symbolic.errors import SettingsError, WorkcellError
 from symbolic.path.spline import path_basis
 from symbolic.records import POSE_SIZE, Workcell
 
-SEARCH_ROUNDS = ((0, 12, 0), (500, 12, 2), (2500, 6, 6), (8000, 16, 6), (30000, 24, 6))
+SEARCH_ROUNDS = ((0, 12, 0), (2000, 12, 3), (8000, 6, 6), (30000, 16, 6), (100000, 24, 6))
 """Rounds of the search, short ones first: number of configurations that the planner may check for a
 path (0 for straight motions alone), number of pairs of holds, and number of `STRAYS`."""
 
@@ -59,17 +59,17 @@ RESTARTS = 3
 """Number of repetitions of the last round, with other random numbers, while no carry is found and
 time is left."""
 
-OTHER_FACES = 8000
+OTHER_FACES = 30000
 """From this number of configurations per path on, other faces of the box are tried too, if both
 arms can hold it by the faces toward them."""
 
 STRAYS = (
     Corridor(0.0, 0.15, 0.8),
+    Corridor(0.3, 0.15, 0.15),
     Corridor(0.3, 0.15, 0.8),
     Corridor(0.0, 0.15, 0.3),
+    Corridor(0.3, 0.15, 0.3),
     Corridor(0.0, 0.05, 0.3),
-    Corridor(0.0, 0.15, 0.15),
-    Corridor(0.3, 0.05, 0.8),
 )
 """Corridors within which paths are searched. A gap that lies in a narrower corridor is found
 sooner."""
@@ -239,7 +239,6 @@ def propose(
     Raises:
         WorkcellError: the file is wrong.
         ProposalError: no carry was found; the message names the obstacle.
-        SettingsError: OMPL is not installed.
     """
     return propose_classes(path, rng=rng, settings=settings, tell=tell, progress=progress)[0]
 
@@ -271,7 +270,6 @@ def propose_classes(
     Raises:
         WorkcellError: the file is wrong.
         ProposalError: no carry was found; the message names the obstacle.
-        SettingsError: OMPL is not installed.
     """
     settings = settings or ProposeSettings()
     with progress_bar(progress, "seconds of work", ceil(settings.seconds)) as advance:
@@ -457,14 +455,13 @@ class _Search:
                 return
             ends = pair.start.extended, pair.goal.extended
             room = search_subspace(*ends, stray, np.array(limits).reshape(-1, 2))
-            seed = int(self.rng.integers(1, 2**31))
             yield plan(
                 pair.chain,
                 pair.retreats,
                 room,
                 most=effort,
                 out_of_time=lambda: self.too_late,
-                seed=seed,
+                rng=self.rng,
             )
 
     def _via_points(self, pair: Pair, corners: list[ChainConfiguration]) -> Array | None:

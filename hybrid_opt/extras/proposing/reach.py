@@ -3,23 +3,25 @@ while the box does not move.
 
 An arm cannot change its branch while it holds the box. If a job begins in another branch than the
 arm's present one, the arm changes it on this path. Both arms move at the same time along straight
-lines of their joints from corner to corner. RRT-Connect of OMPL finds the corners, shortcuts remove
-needless ones, and every line is proven free of collisions.
+lines of their joints from corner to corner. Trees of such lines (`trees.py`) find the corners,
+shortcuts remove needless ones, and every line is proven free of collisions.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hybrid_opt.carry import joints_of
 from hybrid_opt.collision.certify import certify
 from hybrid_opt.collision.checker import CollisionChecker
 from hybrid_opt.compiled_cell import CACHED_WORKCELLS, CompiledCell
 from hybrid_opt.errors import JobError
-from hybrid_opt.extras.proposing.planner import connected
+from hybrid_opt.extras.proposing.trees import connect, inner_points
 from hybrid_opt.job.plan import JobCollisions, SupportedPose
 from hybrid_opt.job.records import Job
 from symbolic.array import Array
@@ -30,7 +32,7 @@ JOINT_STEP = 0.04
 """Largest change of a joint between configurations that are checked on a line [rad or m]."""
 
 RANGE = 1.5
-"""Longest line by which the planner's trees grow [rad]."""
+"""Longest line by which the trees grow [rad]."""
 
 MOST_LOOKED = 400_000
 """Largest number of configurations that one attempt may check."""
@@ -63,8 +65,7 @@ def plan_reach(job: Job, q: Array, *, rng: np.random.Generator, after: bool = Fa
         of their joints, in the same time.
 
     Raises:
-        SettingsError: q does not fit the cell or exceeds a joint's limits, or OMPL is not
-            installed.
+        SettingsError: q does not fit the cell or exceeds a joint's limits.
         JobError: the arms collide at an end of the path, or no path was found.
     """
     cell, end = job.workcell, job.phases[-1 if after else 0].motion.q[-1 if after else 0]
@@ -81,7 +82,7 @@ def plan_reach(job: Job, q: Array, *, rng: np.random.Generator, after: bool = Fa
     for _ in range(ATTEMPTS):
         corners = [q, end]
         if not lines.proven(q, end):
-            corners = _connected(lines, q, end, bounds, int(rng.integers(1, 2**31)))
+            corners = _connected(lines, q, end, bounds, rng)
             corners = _shortened(lines, corners)
         if all(lines.proven(a, b) for a, b in pairwise(corners)):
             return np.array(corners[::-1] if after else corners)
@@ -113,18 +114,28 @@ class _Lines:
         touch = self._checker.check(*self._placed(q[None])).first_touch
         return "" if touch is None else str(touch)
 
-    def free(self, first: Array, second: Array) -> bool:
-        """Return True if no sampled position on a straight line in joint space collides. The first
-        end is not checked.
+    def free(self, first: Array, second: Array) -> NDArray[np.bool_]:
+        """Find straight lines in joint space on which no sampled position collides. Their first
+        ends are not checked.
 
         Args:
-            first: (joints,) joint positions of both arms at the beginning of the line [rad or m].
-            second: (joints,) joint positions at its end [rad or m].
+            first: (k, joints) joint positions of both arms at the beginnings [rad or m].
+            second: (k, joints) joint positions at the ends [rad or m].
+
+        Returns:
+            (k,) True for such lines.
         """
-        n = int(np.ceil(np.abs(second - first).max() / JOINT_STEP)) + 1
-        q = np.linspace(first, second, n + 1)[1:]
+        found = ~self._colliding(second)
+        counts = np.ceil(np.abs(second - first).max(axis=1) / JOINT_STEP).astype(np.intp) + 1
+        for which, share in inner_points(counts):
+            asked = found[which]
+            which, u = which[asked], share[asked, None]
+            found[which[self._colliding(first[which] + u * (second[which] - first[which]))]] = False
+        return found
+
+    def _colliding(self, q: Array) -> NDArray[np.bool_]:
         self.looked += len(q)
-        return self._checker.check(*self._placed(q)).is_free
+        return self._checker.check(*self._placed(q)).colliding
 
     def proven(self, first: Array, second: Array) -> bool:
         """Return True if a whole straight line in joint space is proven free of collisions.
@@ -138,41 +149,51 @@ class _Lines:
             return self._placed(first + u[:, None] * (second - first))
 
         grid = np.linspace(0.0, 1.0, PROOF_POINTS)
-        return self.free(first, second) and certify(self._checker, at, grid).is_free
+        free = bool(self.free(first[None], second[None])[0])
+        return free and certify(self._checker, at, grid).is_free
 
 
 def _connected(
-    lines: _Lines, q: Array, end: Array, bounds: tuple[Array, Array], seed: int
+    lines: _Lines,
+    q: Array,
+    end: Array,
+    bounds: tuple[Array, Array],
+    rng: np.random.Generator,
 ) -> list[Array]:
-    """Find the corners of a path of both arms by the planner RRT-Connect.
+    """Find the corners of a path of both arms by trees that grow.
 
     Args:
         lines: collision checker of straight motions.
         q: (joints,) joint positions at the beginning [rad or m].
         end: (joints,) joint positions at the end [rad or m].
         bounds: lower and upper joint limits (joints,) [rad or m].
-        seed: seed of the planner.
+        rng: generator of random positions.
 
     Returns:
         Corners (joints,), both ends included.
 
     Raises:
-        JobError: RRT-Connect finds no path.
+        JobError: no path is found.
     """
+
+    def join(begins: Sequence[Array], points: Array) -> list[Array | None]:
+        free: NDArray[np.bool_] = lines.free(np.array(begins), points)
+        return [point if fine else None for point, fine in zip(points, free, strict=True)]
+
     last = lines.looked + MOST_LOOKED
-    path = connected(
-        bounds,
+    path = connect(
+        ((q[None], [q]), (end[None], [end])),
         RANGE,
-        lambda first, second: lines.free(np.array(first), np.array(second)),
-        [[tuple(q.tolist())], [tuple(end.tolist())]],
+        lambda count: rng.uniform(*bounds, (count, len(q))),
+        join,
+        lambda one, other: True,
         lambda: lines.looked >= last,
-        seed,
     )
     if path is None:
         raise JobError(
             f"no way of the arms was found among {MOST_LOOKED} configurations; {_CLOSER}"
         )
-    return [q, *map(np.array, path[1:-1]), end]
+    return path
 
 
 def _shortened(lines: _Lines, corners: list[Array]) -> list[Array]:

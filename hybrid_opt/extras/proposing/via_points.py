@@ -33,11 +33,17 @@ MOST_VIA_POINTS = 6
 LEAST_SAMPLES = 60
 """Smallest number of points of a spline that are checked."""
 
-SHIFTS = 12
-"""Number of random shifts of via-points that are tried if fits collide."""
+SHIFTS = 24
+"""Number of random shifts of the best via-points that are tried together if fits collide."""
 
-SHIFT = 0.04
-"""Standard deviation of the shifts [m]; for rotations with the lever of `distance`."""
+NO_BETTER = 6
+"""Number of such sets in sequence without a better one, after which no further set is tried."""
+
+SHIFT = 0.06
+"""Standard deviation of the largest shifts [m]; for rotations with the lever of `distance`."""
+
+SHIFT_SIZES = (1.0, 0.3, 0.1, 0.03)
+"""Shares of this deviation, one of which is drawn for each shift."""
 
 GENERATIONS = 60
 """Number of generations of the evolution strategy that shortens a free spline."""
@@ -124,7 +130,8 @@ def fit(
     found.
 
     The search tries points on the path at even distances, the points whose spline is nearest to the
-    path, interpolations between these two, and random shifts of the best.
+    path, interpolations between these two, and random shifts of the best so
+    far.
 
     Args:
         chain: both arms, whose pads stay fixed on the box.
@@ -139,29 +146,31 @@ def fit(
     steps = [distance(a, b) for a, b in pairwise(points)]
     share = np.concatenate([[0.0], np.cumsum(steps)])
     u = np.linspace(0.0, 1.0, LEAST_SAMPLES)
-    even = np.column_stack([np.interp(u * share[-1], share, column) for column in points.T])
-    at = np.linspace(0.0, 1.0, count + 2)
-    on_path = np.column_stack([np.interp(at * share[-1], share, column) for column in points.T])
+
+    def at(u: Array, columns: Array) -> Array:
+        return np.column_stack([np.interp(u * share[-1], share, column) for column in columns.T])
+
+    on_path = at(np.linspace(0.0, 1.0, count + 2), points)
     basis = path_basis(count + 2, u).position
-    rest = even - basis[:, [0, -1]] @ on_path[[0, -1]]
+    rest = at(u, points) - basis[:, [0, -1]] @ on_path[[0, -1]]
     nearest = on_path.copy()
     nearest[1:-1] = np.linalg.lstsq(basis[:, 1:-1], rest, rcond=None)[0]
-    best, most = on_path, -1.0
-    for weight in (0.0, 0.5, 1.0):
-        waypoints = (1.0 - weight) * on_path + weight * nearest
-        free = free_share(chain, path[0], waypoints)
-        if free == 1.0:
-            return waypoints[1:-1]
-        if free > most:
-            best, most = waypoints, free
-    for _ in range(SHIFTS):
-        waypoints = best.copy()
-        waypoints[1:-1, :3] += rng.normal(0.0, SHIFT, (count, 3))
-        free = free_share(chain, path[0], waypoints)
-        if free == 1.0:
-            return waypoints[1:-1]
-        if free > most:
-            best, most = waypoints, free
+    q_1, q_2 = (at(u, np.array([place.q[arm] for place in path])) for arm in (0, 1))
+    lever = metric_weights(points.shape[1])
+    tried = np.array([(1.0 - weight) * on_path + weight * nearest for weight in (0.0, 0.5, 1.0)])
+    best, least, worse = on_path, np.inf, 0
+    while worse < NO_BETTER:
+        _, blocked = _lengths(chain, basis @ tried, (q_1, q_2))
+        for waypoints in tried[blocked == 0.0]:
+            if free_share(chain, path[0], waypoints) == 1.0:
+                return np.asarray(waypoints[1:-1])
+        k = int(np.argmin(blocked))
+        worse = 0 if blocked[k] < least else worse + 1
+        if not worse:
+            best, least = tried[k], blocked[k]
+        size = SHIFT * rng.choice(SHIFT_SIZES, (SHIFTS, 1, 1))
+        tried = np.tile(best, (SHIFTS, 1, 1))
+        tried[:, 1:-1] += size * rng.normal(size=(SHIFTS, count, len(lever))) / lever
     return None
 
 
@@ -203,7 +212,7 @@ def shorten_spline(
         return np.vstack([waypoints[0], inner, waypoints[-1]])
 
     options = {"popsize": OFFSPRING, "seed": int(rng.integers(1, 2**31)), "verbose": -9}
-    strategy = cma.CMAEvolutionStrategy((waypoints[1:-1] * lever).ravel(), SHIFT / 2.0, options)
+    strategy = cma.CMAEvolutionStrategy((waypoints[1:-1] * lever).ravel(), SHIFT / 3.0, options)
     for _ in range(GENERATIONS):
         asked = strategy.ask()
         tried = [moved(np.asarray(y)) for y in asked]

@@ -25,14 +25,5 @@ MODULE CarryEgm$number
     ENDIF
   ENDPROC
 
-  ! It does not move the arm there: nobody has checked such a move for collisions.
-  PROC CarryCheckStart()
-    VAR jointtarget here;
-    here := CJointT();
-    IF $away THEN
-      TPWrite "Carry: jog the robot to carryFirst, pads away from the box.";
-      ! After Stop, a press of Start would go on behind the check.
-      EXIT;
-    ENDIF
-  ENDPROC
+$check
 ENDMODULE

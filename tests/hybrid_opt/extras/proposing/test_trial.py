@@ -254,8 +254,14 @@ def found_in(setup: Setup, seed: int, out_of_time: bool = False) -> list[ChainCo
     pair = setup.pairs[0]
     ends = pair.start.extended, pair.goal.extended
     room = search_subspace(*ends, Corridor(0.0, 0.15, 0.8), NO_LIMITS)
-    until = {"most": 20_000, "out_of_time": lambda: out_of_time}
-    return plan(pair.chain, pair.retreats, room, **until, seed=seed)  # type: ignore[arg-type]
+    return plan(
+        pair.chain,
+        pair.retreats,
+        room,
+        most=100_000,
+        out_of_time=lambda: out_of_time,
+        rng=np.random.default_rng(seed),
+    )
 
 
 def planned(setup: Setup, seed: int) -> list[ChainConfiguration]:
@@ -316,6 +322,26 @@ def test_paths_hold_the_box_with_both_arms_and_are_free(
         assert np.abs(np.diff(q, axis=0)).max() < 0.5
         assert np.all(q >= shelf.workcell.robots[arm].position_lower)
         assert np.all(q <= shelf.workcell.robots[arm].position_upper)
+
+
+def test_many_motions_are_followed_as_one_after_another(
+    shelf: Setup, first: list[ChainConfiguration]
+) -> None:
+    """Motions of 0.1 m or rad in all directions, from places on a path."""
+    pair, rng = shelf.pairs[0], np.random.default_rng(2)
+    begins = 3 * shortened_path(shelf, first)
+    away = rng.normal(size=(len(begins), len(pair.start.extended)))
+    away *= 0.1 / np.linalg.norm(away, axis=1, keepdims=True)
+    ends = np.array([begin.extended for begin in begins]) + away
+    found = pair.chain.reach_many(begins, ends)
+    alone = [pair.chain.reach(*both) for both in zip(begins, ends, strict=True)]
+    free = [place is not None for place in alone]
+    assert 20 < sum(free) < len(free) - 20
+    assert [place is not None for place in found] == free
+    for one, other in zip(found, alone, strict=True):
+        if one is not None and other is not None:
+            np.testing.assert_array_equal(one.extended, other.extended)
+            np.testing.assert_allclose(np.hstack(one.q), np.hstack(other.q), atol=1e-5)
 
 
 def test_straight_motions_lead_out_of_the_shelf_and_in_again(shelf: Setup) -> None:
