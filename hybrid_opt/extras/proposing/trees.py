@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from symbolic.array import Array
 
-TOGETHER = 64
+TARGETS_TOGETHER = 64
 """Number of random points towards which a tree grows in one step."""
 
 Configuration = TypeVar("Configuration")
@@ -51,7 +51,7 @@ def connect(
     trees, grows = [_Tree(*end, longest, join) for end in ends], 0
     while not ended():
         own, other = trees[grows], trees[1 - grows]
-        targets = draw(TOGETHER)
+        targets = draw(TARGETS_TOGETHER)
         new, _ = own.grow(own.nearest(targets), targets)
         met = _meeting(own, other, new, same, ended)
         if met is not None:
