@@ -23,7 +23,7 @@ from hybrid_opt.display_protocol import Displayable
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
 from hybrid_opt.evaluate.objectives import front_rows
 from hybrid_opt.indicators import metrics
-from hybrid_opt.polishing.records import PolishedFront
+from hybrid_opt.polishing.front import PolishedFront
 from hybrid_opt.polishing.settings import PolishSettings, default_settings
 from hybrid_opt.progress import ShowProgress, as_callback, progress_bar
 from symbolic.array import Array, set_read_only

@@ -53,7 +53,7 @@ def _add_options(parser: Parser) -> None:
     parser.add_argument(
         "--smoothing",
         type=float,
-        default=stated("hybrid_opt.job.smooth.SMOOTHING_WIDTH"),
+        default=stated("hybrid_opt.timing.smoothing.SMOOTHING_WIDTH"),
         metavar="S",
         help="half the width of the window over which a timing with jumps of acceleration is "
         "averaged [s]; 0 keeps it unchanged",

@@ -87,7 +87,7 @@ def build_cell_bodies(workcell: Workcell, known: CellBodies | None = None) -> Ce
     """
     task = workcell.task
     first, second = (
-        build_robot_model(robot, task.redundant_places[i], task.extended_size, task.orientation)
+        build_robot_model(robot, task.redundant_entries[i], task.extended_size, task.orientation)
         for i, robot in enumerate(workcell.robots)
     )
     found = CellBodies(workcell, (first, second), build_geometry(workcell))

@@ -16,8 +16,8 @@ from hybrid_opt.campaign.results import is_whole, read_campaign, read_polished
 from hybrid_opt.campaign.settings import CampaignSettings, polished_file
 from hybrid_opt.campaign.stages import Stage, loaded_cell, store_results
 from hybrid_opt.front import Front, polish
-from hybrid_opt.polishing.front import use_one_thread
 from hybrid_opt.polishing.settings import PolishSettings
+from hybrid_opt.polishing.solvers.ipopt import use_one_thread
 from hybrid_opt.progress import Progress, ShowProgress
 from hybrid_opt.store.files import to_json
 from symbolic.array import Array

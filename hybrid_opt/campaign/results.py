@@ -36,7 +36,7 @@ from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.evaluate.evaluation import Evaluations, concatenated
 from hybrid_opt.evaluate.objectives import front_rows
 from hybrid_opt.front import Front
-from hybrid_opt.polishing.records import PolishedFront
+from hybrid_opt.polishing.front import PolishedFront
 from hybrid_opt.store.bundle_file import MANIFEST, read_manifest
 from hybrid_opt.store.files import (
     from_json,

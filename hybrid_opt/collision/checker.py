@@ -54,7 +54,7 @@ class CollidingPair:
     Attributes:
         sample: index of the sample at which they collide, or of the sample before.
         first, second: names of the bodies.
-        fraction: place between this sample (0) and the next sample (1).
+        fraction: share of the way from this sample (0) to the next one (1).
     """
 
     sample: int
@@ -95,9 +95,9 @@ class CollisionChecker:
             or interpreted.
         free_beyond: (n_pairs,) distance [m]; a pair of bodies is free if the lower bound of its
             distance exceeds it.
-        resting_places: places at which the payload may rest on a body of the environment, one for
-            each allowed contact and fixed pose that touches the body: index of the pair, box centre
-            (3,) [m], and departure [m].
+        resting_places: positions at which the payload may rest on a body of the environment, one
+            for each allowed contact and fixed pose that touches the body: index of the pair, box
+            centre (3,) [m], and departure [m].
     """
 
     def __init__(self, geometry: CellGeometry, functions: Mapping[str, NumericFunction]) -> None:

@@ -39,7 +39,7 @@ class Explanation:
         excess: distance of this joint beyond its limit [rad, or m for a sliding joint].
         unit: unit of the excess.
         robot: name of the arm that does not reach its contact; None for another reason.
-        missing: distance of this arm's flange from the place that it has to reach [m].
+        missing: distance of this arm's flange from the position that it has to reach [m].
     """
 
     reason: str

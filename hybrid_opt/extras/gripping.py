@@ -1,7 +1,7 @@
-"""Choice of the places where two pads press on their faces, by the cost of the hand-made path.
+"""Choice of the positions of two pads on their faces, by the cost of the hand-made path.
 
-The places are parameters of the cell, so that a trial costs as much as a changed cell and needs no
-compiler. Both pads move alike, so that they stay opposite each other.
+The positions are parameters of the cell, so that a trial costs as much as a changed cell and needs
+no compiler. Both pads move alike, so that they stay opposite each other.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from symbolic.records import Workcell
 from symbolic.records.poses import box_rotation
 
 TRIALS = 40
-"""Default number of places that are tried; equal places count each time."""
+"""Default number of positions that are tried; equal positions count each time."""
 
 UPRIGHT_FACE = 0.9
 """Least length of the projection of the world's z axis onto a face that counts as upright."""
 
 WORST = 1e9
-"""Cost of a place with which the path cannot be driven [N s]."""
+"""Cost of positions with which the path cannot be driven [N s]."""
 
 Range = tuple[float, float]
 """Lower and upper bound [m]."""
@@ -36,17 +36,18 @@ Range = tuple[float, float]
 
 @dataclass(frozen=True)
 class Grip:
-    """A place of both pads on their faces of the box, and the effort of the hand-made path with it.
+    """Positions of both pads on their faces of the box, and the effort of the hand-made path with
+    them.
 
     Attributes:
-        cell: the cell with the pads at this place, and nothing else changed.
-        up, along: shift of the pads from their place in the file, upwards and level along their
-            faces [m].
+        cell: the cell with the pads at these positions, and nothing else changed.
+        up, along: shift of the pads from their positions in the file, upwards and level along
+            their faces [m].
         duration: duration of the hand-made path [s] at the least product of duration and commanded
             force, limits on jerk ignored.
         force: largest commanded force at this duration [N].
-        before: least product of duration and commanded force with the pads at their place in the
-            file [N s]; infinite if the path could not be driven.
+        before: least product of duration and commanded force with the pads at their positions
+            in the file [N s]; infinite if the path could not be driven.
     """
 
     cell: Cell

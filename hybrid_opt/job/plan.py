@@ -48,11 +48,11 @@ from hybrid_opt.job.motions import (
     zero_forces,
 )
 from hybrid_opt.job.records import SWITCHES, Job, Phase, PhaseMotion
-from hybrid_opt.job.smooth import LARGEST_WIDTH, SMOOTHING_WIDTH, has_rest_at_ends, without_jumps
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
-from hybrid_opt.timing.jerk import applicable_jerk_limits
+from hybrid_opt.timing.jerk import applicable_jerk_limits, has_rest_at_ends, without_jumps
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import JerkLimits, Timing
+from hybrid_opt.timing.smoothing import LARGEST_WIDTH, SMOOTHING_WIDTH
 from symbolic.array import Array, interpolated
 from symbolic.contact.registry import contact_model
 from symbolic.errors import SettingsError

@@ -17,9 +17,14 @@ from typing import Literal
 import numpy as np
 
 from hybrid_opt.polishing.drive import REST_FORCE_MARGIN, DriveStepMethod
-from hybrid_opt.polishing.front import LEAST_SPAN, Attempt, ParetoArchive, PolishRun
-from hybrid_opt.polishing.point import Solution
-from hybrid_opt.polishing.records import Status
+from hybrid_opt.polishing.front import (
+    LEAST_SPAN,
+    Attempt,
+    ParetoArchive,
+    PolishRun,
+    Solution,
+    Status,
+)
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.starts import rotated_starts
 from hybrid_opt.timing.model import TimingModel

@@ -26,14 +26,8 @@ import numpy as np
 from hybrid_opt.polishing.cell import CarryReader, PlacedCarry, SmoothCell
 from hybrid_opt.polishing.constraints.active import RowSelector
 from hybrid_opt.polishing.constraints.kinds import MinimisedForces
-from hybrid_opt.polishing.point import (
-    Iterate,
-    Solution,
-    Step,
-    StepEvaluation,
-    StepMethod,
-    TrustRegionSolve,
-)
+from hybrid_opt.polishing.front import Solution
+from hybrid_opt.polishing.point import Iterate, Step, StepEvaluation, StepMethod, TrustRegionSolve
 from hybrid_opt.polishing.rows import PROGRAM_BRANCH, ConstraintRows, Row, RowLayout
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.solvers.base import Residuals, Solve, optimality_residuals
@@ -100,8 +94,8 @@ class Scalarisation:
 
     @property
     def limits(self) -> MinimisedForces:
-        """For each robot, True if its peak force bounds the level a that is minimised; False if the
-        peak force only has a small weight, which decides between solutions with equal levels.
+        """For each robot, True if its peak force bounds the minimised level a (see the class);
+        False if it only has a small weight, which decides between solutions with equal levels.
         """
         first, second = (self.offset < UNBOUNDED_OFFSET).tolist()
         return first, second

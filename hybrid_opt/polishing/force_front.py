@@ -35,12 +35,14 @@ from hybrid_opt.polishing.front import (
     IMPROVEMENT_TOLERANCE,
     LEAST_SPAN,
     OWN_SHARE,
+    Aim,
     Attempt,
     ParetoArchive,
+    PolishOutcome,
     PolishRun,
+    Solution,
+    Status,
 )
-from hybrid_opt.polishing.point import Solution
-from hybrid_opt.polishing.records import Aim, PolishOutcome, Status
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.starts import Start, mirror_of, perturb_start, random_starts
 from symbolic.array import Array, evenly

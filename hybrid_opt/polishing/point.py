@@ -25,8 +25,9 @@ import numpy as np
 from hybrid_opt.polishing.cell import CarryReader, PlacedCarry, SmoothCell
 from hybrid_opt.polishing.constraints.active import RowSelector, WorkingSet
 from hybrid_opt.polishing.constraints.kinds import MinimisedForces
+from hybrid_opt.polishing.front import Solution
 from hybrid_opt.polishing.rows import PathRow, Row
-from hybrid_opt.polishing.solvers.base import UNKNOWN, Residuals
+from hybrid_opt.polishing.solvers.base import Residuals
 from symbolic.array import Array
 
 OPTIMUM_TOLERANCE = 5e-4
@@ -125,31 +126,6 @@ class TrustRegion:
         elif reduction_ratio is not None and reduction_ratio <= LOW_RATIO:
             self.radius *= HALVED
         self._was_good = True
-
-
-@dataclass
-class Solution:
-    """Result of a trust-region solve, not yet checked by the full evaluator.
-
-    Attributes:
-        x: (n_var,) best candidate; the start if nothing improved on it.
-        message: text on how the solve ended.
-        converged: True if the solver reports that x is a stationary point.
-        usable: True if the start could be evaluated.
-        residuals: optimality residuals at x, of the last program.
-        iterations: number of solver iterations, over all trust-region iterations.
-        rounds: number of trust-region iterations.
-        rows: number of rows (scalar inequalities) at points of the path in the last program.
-    """
-
-    x: Array
-    message: str = ""
-    converged: bool = False
-    usable: bool = False
-    residuals: Residuals = UNKNOWN
-    iterations: int = 0
-    rounds: int = 0
-    rows: int = 0
 
 
 @dataclass(frozen=True)

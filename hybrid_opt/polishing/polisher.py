@@ -16,9 +16,8 @@ from hybrid_opt.polishing.drive import DriveStepMethod
 from hybrid_opt.polishing.drive_front import DriveRun
 from hybrid_opt.polishing.force import ForceSolver
 from hybrid_opt.polishing.force_front import ForceRun
-from hybrid_opt.polishing.front import ParetoArchive, PolishRun
+from hybrid_opt.polishing.front import ParetoArchive, PolishedFront, PolishRun
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
-from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.timing.model import TimingModel
 from symbolic.array import Array

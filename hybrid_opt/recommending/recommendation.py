@@ -23,7 +23,6 @@ from hybrid_opt.front import Front
 from hybrid_opt.job.compliance import separation
 from hybrid_opt.job.plan import CommandedForces, command_forces, job_model
 from hybrid_opt.job.records import Job
-from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.progress import ShowProgress, progress_bar
 from hybrid_opt.recommending.advice import Advice, advice, commanded_margins
 from hybrid_opt.recommending.choice import (
@@ -51,6 +50,7 @@ from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.robust.force import robust_model, subsample
 from hybrid_opt.robust.squeeze import MOST, Squeeze, largest_commanded
 from hybrid_opt.static_hold import static_hold
+from hybrid_opt.timing.jerk import driven_timing
 from hybrid_opt.timing.records import Timing
 from hybrid_opt.timing.robustness import Margin
 from symbolic.array import Array, Figure, evenly
@@ -353,11 +353,12 @@ def _driven(
 def _with_job(
     cell: Cell, paths: DrivenPaths, options: Sequence[Option], goal: Goal, force: float
 ) -> tuple[Option, Timing, CommandedForces] | None:
-    """Choose the carry to recommend among carries of less commanded force, which are slower, until
-    its job keeps all limits.
+    """Choose a carry whose job keeps all limits: try slower carries with less and less commanded
+    force.
 
-    Timings limit joint torques under the planned forces, jobs under the commanded ones. The excess
-    over the least commanded force of all carries is halved each time.
+    A job may exceed a limit that its carry's timing keeps, because timings limit joint torques
+    under the planned forces, jobs under the commanded ones. Each trial halves the excess of the
+    commanded force over the least one of all carries.
 
     Args:
         cell, paths, options, goal: as for `_driven`.

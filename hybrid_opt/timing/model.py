@@ -366,8 +366,8 @@ class TimingModel:
         for values, pose, moved in zip(extended, box, joints, strict=True):
             values[:, :6] = pose[some]
             for arm, own in enumerate(joints_of(self.workcell, moved[some])):
-                for joint, place in task.redundant_places[arm]:
-                    values[:, place] = own[:, joint]
+                for joint, entry in task.redundant_entries[arm]:
+                    values[:, entry] = own[:, joint]
         q = map(np.ascontiguousarray, joints_of(self.workcell, motion.q[some]))
         rows = self._sample_limits.batch(*extended, *q)["limits"]
         names = ("pose", "pose_first", "pose_second")

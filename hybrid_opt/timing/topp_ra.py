@@ -20,13 +20,13 @@ from typing import Any
 import numpy as np
 
 from hybrid_opt.carry import Carry
-from hybrid_opt.timing.limits import (
+from hybrid_opt.timing.model import REFINEMENT, PathMotion, SpeedProfile, TimingModel
+from hybrid_opt.timing.programs import (
     LINEARISED_ABOVE,
     PathLimits,
     duration_at_speed_limits,
     squared_speed_limit,
 )
-from hybrid_opt.timing.model import REFINEMENT, PathMotion, SpeedProfile, TimingModel
 from hybrid_opt.timing.records import (
     FRICTION_RATIO,
     PathTiming,
@@ -55,10 +55,10 @@ FORCE_SHARPNESS = 0.02
 
 @dataclass(frozen=True)
 class LinearLimits:
-    """k linear limits alpha u'' + beta u'^2 <= bound at each of n places.
+    """k linear limits alpha u'' + beta u'^2 <= bound at each of n points of the path, or in each of
+    n intervals.
 
-    A place is a point of the path, or an interval. For an interval, u'' is its constant path
-    acceleration and u'^2 is taken at its beginning.
+    In an interval, u'' is the constant path acceleration and u'^2 is taken at the beginning.
 
     Attributes:
         alpha, beta, bound: (n, k) coefficients and bounds.

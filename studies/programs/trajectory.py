@@ -33,7 +33,6 @@ from hybrid_opt.job.compliance import (
 )
 from hybrid_opt.job.plan import command_forces, job_model
 from hybrid_opt.job.records import Job
-from hybrid_opt.job.smooth import driven_limits, driven_timing
 from hybrid_opt.progress import Progress
 from hybrid_opt.robust.force import LARGEST_FACTOR, RobustModel, robust_model
 from hybrid_opt.robust.price import robust_price
@@ -42,6 +41,7 @@ from hybrid_opt.store.bundle_file import read_manifest
 from hybrid_opt.store.files import read_bytes, to_json
 from hybrid_opt.store.trajectory_file import Replay, StoredTrajectory, read_trajectory, replay
 from hybrid_opt.timing.analysis import time_trajectory, timing_document
+from hybrid_opt.timing.jerk import driven_limits, driven_timing
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import Timing, TimingLimits
 from hybrid_opt.timing.solve import time_path

@@ -22,11 +22,11 @@ from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.job.motions import TICK
 from hybrid_opt.job.plan import JobModel
 from hybrid_opt.job.records import Job, Phase
-from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.robust.cases import LEADER
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.robust.squeeze import SqueezeSettings, commanded_forces
 from hybrid_opt.timing.analysis import drivable_timing
+from hybrid_opt.timing.jerk import driven_timing
 from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
 from hybrid_opt.timing.robustness import Margin, robustness_margins
 from hybrid_opt.timing.solve import time_path

@@ -18,9 +18,9 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import PAPER_OBJECTIVES
 from hybrid_opt.front import Front, polish
 from hybrid_opt.indicators import metrics
-from hybrid_opt.polishing.front import use_one_thread
-from hybrid_opt.polishing.records import PolishedFront
+from hybrid_opt.polishing.front import PolishedFront
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings
+from hybrid_opt.polishing.solvers.ipopt import use_one_thread
 from hybrid_opt.store.files import AGAIN, read_bytes, write_atomically
 from hybrid_opt.workers import LocalWorkers
 from studies.program import load_workcell

@@ -293,7 +293,9 @@ def summary(found: Sequence[HandThreshold]) -> str:
 
 
 def thresholds(options: argparse.Namespace) -> int:
-    """Find and print the threshold of each random carry in the options. Return the exit code."""
+    """Find and print, for each random carry in the options, the least holding force with which the
+    carry succeeds in the simulator. Return the exit code.
+    """
     print("hands        count  swings      needed   rims   ratio  below it")
     found = []
     for k, kind in enumerate(islice(cycle(KINDS), options.carries)):

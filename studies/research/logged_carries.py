@@ -195,10 +195,11 @@ def _arm(time: Array, force: Array, commanded: Array, poses: _Poses) -> _Arm:
 
 
 def _one_file(path: Path) -> list[_Arm]:
-    """Read a log that has both arms in one file; return the left arm, then the right.
+    """Read a log that has both arms in one file; return the left arm, then the right, in the world
+    frame.
 
-    The logged vectors are in each arm's base frame, grasps and normals also in the world. The
-    result is in the world frame.
+    The log states vectors in each arm's base frame, and grasps and normals in the world frame as
+    well.
     """
     found = []
     with np.load(path) as log:

@@ -40,9 +40,10 @@ def compare(
         seed: seed of candidates and searches.
 
     Returns:
-        For each cell the numbers of bodies, pieces, hulls and pairs; milliseconds per candidate
-        'near_ms' and 'random_ms', means over the rounds; core-seconds 'search_s' of a drivable
-        search; and means of the ratios to the first cell, 'near', 'random' and 'search'.
+        For each cell, by name: the numbers of bodies, pieces, hulls and pairs; mean times per
+        candidate over the rounds, `near_ms` and `random_ms` [ms]; the core-seconds of a drivable
+        search, `search_s`; and the ratios of these times to those of the first cell: `near` and
+        `random`, means over the rounds, and `search`.
     """
     rows: list[dict[str, Any]] = [_contents(cell) for cell in cells]
     for what in ("near", "random"):

@@ -43,7 +43,7 @@ from hybrid_opt.indicators.statistics import (
     rank_test,
     summarise,
 )
-from hybrid_opt.polishing.records import PolishEffort
+from hybrid_opt.polishing.front import PolishEffort
 from hybrid_opt.progress import Progress
 from hybrid_opt.static_hold import StaticHold
 from hybrid_opt.store.files import (

@@ -75,8 +75,7 @@ FLOOR = 1e-9
 
 YIELDING = 1.5
 """Multiple of what a hand bears beyond its capacity that it passes on to all hands, itself
-included. Of 40 random carries, the simulator needs 0.83 times the force of the model or more; with
-1.0 or 2.0 it needs 0.80."""
+included. Near this value, the simulator's and the model's forces for random carries agree best."""
 
 GATE = 3.0
 """Slope with which hands begin to yield. They do not yield while lifting decides; they yield as

@@ -151,8 +151,8 @@ def place_redundant(task: Task, extended: Array, joints: Sequence[Array]) -> Non
         joints: for each arm its joint positions (n, joints), which are changed.
     """
     for arm, q in enumerate(joints):
-        for joint, place in task.redundant_places[arm]:
-            q[:, joint] = extended[:, place]
+        for joint, entry in task.redundant_entries[arm]:
+            q[:, joint] = extended[:, entry]
 
 
 MXGroups = Mapping[str, ca.MX]

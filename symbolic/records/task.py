@@ -142,7 +142,7 @@ class Task:
         return POSE_SIZE + len(self.redundant)
 
     @cached_property
-    def redundant_places(self) -> tuple[tuple[tuple[int, int], ...], ...]:
+    def redundant_entries(self) -> tuple[tuple[tuple[int, int], ...], ...]:
         """For each robot its redundant joints, each as a pair: index among the arm's joints, and
         index in the extended pose (6 + m,)."""
         return tuple(

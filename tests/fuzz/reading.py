@@ -15,7 +15,7 @@ import numpy as np
 from codegen.cache import Cache
 from hybrid_opt.campaign.candidates import decode
 from hybrid_opt.campaign.results import read_configuration
-from hybrid_opt.polishing.records import PolishedFront
+from hybrid_opt.polishing.front import PolishedFront
 from hybrid_opt.store.bundle_file import read_manifest
 from hybrid_opt.store.files import read_bytes, read_record
 from hybrid_opt.store.trajectory_file import read_trajectory

@@ -14,7 +14,7 @@ import pytest
 
 from hybrid_opt.campaign.results import read_campaign
 from hybrid_opt.evaluate.objectives import non_dominated
-from hybrid_opt.polishing.records import PolishedFront, PolishEffort
+from hybrid_opt.polishing.front import PolishedFront, PolishEffort
 from studies.report import PAGE
 from studies.report.data import ReportData, ReportRun, gather
 from studies.study.simulation import StoredSimulation

@@ -34,7 +34,6 @@ from symbolic.records.poses import pose_matrix, rpy_from_rotation
 _LONGEST_COMMENT = 60
 WORLD, PAD = "world", "contact_pad"
 PLUGIN = "gz_ros2_control/GazeboSimSystem"
-COMMANDS = ("effort",)
 STATE_INTERFACES = ("position", "velocity", "effort")
 
 ABB = "ABB"
@@ -62,15 +61,7 @@ def require_arms(
     any_arm: bool = False,
 ) -> None:
     """Check that both arms are of the maker of a target and have the joints and addresses that the
-    target needs.
-
-    Args:
-        workcell: the cell with the arms.
-        target: name of the target, for the message.
-        maker: `ABB`, `FRANKA` or `UR`.
-        axes: numbers of joints per arm that the target supports; all joints have to turn.
-        has_address: True if the target needs the addresses of both controllers.
-        any_arm: True to accept arms that do not look like the maker's.
+    target needs. With `any_arm` the maker does not matter.
 
     Raises:
         SettingsError: the file, name, xacro arguments or links of an arm name another maker; an arm
@@ -84,7 +75,6 @@ def require_arms(
                 "(--any-arm) where zero and signs of its joints are the controller's",
                 code="another-maker",
             )
-    for robot in workcell.robots:
         turning = turning_joints(arm_model(robot))
         if len(turning) not in axes or not all(turning):
             slide = "" if all(turning) else f", {turning.count(False)} of them sliding"
@@ -93,7 +83,6 @@ def require_arms(
                 f"hold {' or '.join(map(str, axes))} turning axes, choose another target",
                 code="joint-count",
             )
-    for robot in workcell.robots:
         if has_address and not robot.driver.address:
             raise SettingsError(
                 f"{target} has to know where the controller of {robot.name!r} is: write "
@@ -125,12 +114,8 @@ class Lines:
     meaning: str
 
     def require(self, workcell: Workcell, target: str) -> None:
-        """Check that a target allows the names of a cell's digital outputs, which switch the hands,
-        and digital inputs, which report their state. An input may be left out.
-
-        Args:
-            workcell: the cell.
-            target: name of the target, for the message.
+        """Check that a target can reach the hands of a cell by the names of their outputs and,
+        where stated, of their inputs.
 
         Raises:
             SettingsError: a name is not allowed; the message states the key and the allowed names.
@@ -157,8 +142,8 @@ def plan_of(
     stiffness: float | None,
     presses: bool,
 ) -> dict[str, Any]:
-    """Return the driver settings for which a bundle was planned, as JSON values. The bundle's
-    bring-up program compares them with measured values.
+    """Return the planned values of a bundle as JSON values: driver settings, stiffness and leads.
+    The bundle's bring-up program compares them with measured values.
 
     Args:
         workcell: the cell.
@@ -167,8 +152,8 @@ def plan_of(
         leads: for each arm, the part of its delay that the program compensates by sending commands
             ahead [s].
         stiffness: stiffness of each arm at its pad [N/m]; None if the job does not depend on it.
-        presses: True if the bring-up program presses a block between the pads and measures the
-            force by the arms' sensors.
+        presses: True if the bring-up program presses a block and measures the force by the arms'
+            sensors.
     """
     drivers = [vars(robot.driver).items() for robot in workcell.robots]
     return {
@@ -193,7 +178,6 @@ def addressed(workcell: Workcell, addresses: tuple[str, str]) -> Workcell:
     """Return the cell with other host names or IP addresses of its two controllers.
 
     Args:
-        workcell: the cell.
         addresses: host name or IP address of each robot's controller.
 
     Raises:
@@ -210,10 +194,8 @@ def addressed(workcell: Workcell, addresses: tuple[str, str]) -> Workcell:
 
 
 def described(robot: Robot) -> str:
-    """Return the words that may name the maker of a robot, in one lower-case text.
-
-    The words are its file, its name, its links and the values of its xacro arguments.
-    """
+    """Return the words that may name the maker of a robot, in one lower-case text: its file, name,
+    links and values of xacro arguments."""
     urdf = robot_urdf(robot)
     words = [robot.urdf.name, urdf.name, *urdf.links]
     words += [value for _, value in robot.xacro_arguments]
@@ -234,13 +216,8 @@ def comment(text: str) -> str:
 
 
 def prefixes(workcell: Workcell) -> tuple[str, str]:
-    """Return the prefix of the links' and joints' names in ROS, of the first robot and of the
-    second.
-
-    Both prefixes are '' if the robots are arms of one machine.
-
-    Args:
-        workcell: the cell.
+    """Return the prefix of the links' and joints' names in ROS, of each robot; '' for both if the
+    robots are arms of one machine.
 
     Raises:
         SettingsError: the prefixes in the file would give joints of both arms the same names.
@@ -264,42 +241,21 @@ def prefixes(workcell: Workcell) -> tuple[str, str]:
 
 
 def ros_joints(workcell: Workcell) -> dict[str, int]:
-    """Return the column of each joint in arrays (n, joints) of both arms side by side.
-
-    A joint that moves both arms of a machine has its column in the first arm.
-
-    Args:
-        workcell: the cell.
-
-    Returns:
-        Index of the column by the joint's name in ROS.
-
-    Raises:
-        SettingsError: joints of both arms would have the same names.
-    """
+    """Return the column of each joint, by its name in ROS, in arrays (n, joints) of both arms side
+    by side. A joint that moves both arms of a machine has its column in the first arm."""
     both = zip(workcell.robots, prefixes(workcell), strict=True)
     names = [f"{prefix}{name}" for robot, prefix in both for name in _moving(robot)]
     return {name: names.index(name) for name in names}
 
 
 def pad_frame(prefix: str, arm: int) -> str:
-    """Return the name of the frame of an arm's pad.
-
-    Args:
-        prefix: prefix of the arm's names in ROS, or ''.
-        arm: index of the arm, used if there is no prefix.
-    """
+    """Return the name of the frame of an arm's pad, from its prefix or, without one, its index."""
     return f"{prefix or f'arm_{arm + 1}_'}{PAD}"
 
 
 def description(workcell: Workcell, q: Array) -> str:
-    """Return the URDF of the cell with both arms, as text.
-
-    Args:
-        workcell: the cell.
-        q: (joints,) initial joint positions in a simulator, both arms side by side [rad, or m for
-            sliding joints].
-    """
+    """Return the URDF of the cell with both arms, as text, with their joint positions q (joints,)
+    in a simulator at its start, side by side [rad or m]."""
     root = ElementTree.Element("robot", {"name": "cell"})
     ElementTree.SubElement(root, "link", {"name": WORLD})
     shared = one_machine(workcell.robots)
@@ -351,12 +307,7 @@ def _add_robot(root: ElementTree.Element, robot: Robot, prefix: str, moving: set
 
 
 def _hold(joint: ElementTree.Element, position: float) -> None:
-    """Change a URDF joint, in place, to a fixed joint at one of its positions.
-
-    Args:
-        joint: element of the joint.
-        position: position of the joint [rad, or m for a sliding joint].
-    """
+    """Change a URDF joint, in place, to a fixed joint at one of its positions [rad or m]."""
     origin, axis = joint.find("origin"), joint.find("axis")
     xyz, rpy = (
         _numbers("0 0 0" if origin is None else origin.get(key, "0 0 0")) for key in ("xyz", "rpy")
@@ -376,14 +327,7 @@ def _hold(joint: ElementTree.Element, position: float) -> None:
 
 
 def _add_fixed(root: ElementTree.Element, parent: str, name: str, bodies: Sequence[Body]) -> None:
-    """Add a link with bodies to a URDF, by a fixed joint and with the frame of its parent link.
-
-    Args:
-        root: the URDF.
-        parent: name of the parent link.
-        name: name of the new link.
-        bodies: the bodies, at their poses on the link.
-    """
+    """Add a link with bodies to a URDF, with the frame of its parent link."""
     _joint(root, f"{name}_fixed", parent, name, np.eye(4))
     link = ElementTree.SubElement(root, "link", {"name": name})
     for body in bodies:
@@ -391,14 +335,8 @@ def _add_fixed(root: ElementTree.Element, parent: str, name: str, bodies: Sequen
 
 
 def _shapes(link: ElementTree.Element, shape: Shape | Capsule | UrdfMesh, pose: Array) -> None:
-    """Add a shape to a URDF link, as visual and as collision geometry. Capsules, which URDF lacks,
-    become a cylinder and two spheres.
-
-    Args:
-        link: element of the link.
-        shape: the shape.
-        pose: (4, 4) pose of the shape on the link.
-    """
+    """Add a shape at a pose (4, 4) to a URDF link, as visual and as collision geometry. Capsules,
+    which URDF lacks, become a cylinder and two spheres."""
     if isinstance(shape, Capsule):
         _shapes(link, Cylinder(shape.radius, shape.length), pose)
         for side in (-0.5, 0.5):
@@ -430,8 +368,7 @@ def _add_hardware(root: ElementTree.Element, joints: Sequence[str], q: Array) ->
     ElementTree.SubElement(hardware, "plugin").text = PLUGIN
     for name, position in zip(joints, q.tolist(), strict=True):
         joint = ElementTree.SubElement(control, "joint", {"name": name})
-        for command in COMMANDS:
-            ElementTree.SubElement(joint, "command_interface", {"name": command})
+        ElementTree.SubElement(joint, "command_interface", {"name": "effort"})
         for state in STATE_INTERFACES:
             interface = ElementTree.SubElement(joint, "state_interface", {"name": state})
             if state == "position":

@@ -35,9 +35,9 @@ from hybrid_opt.job.compliance import (
 )
 from hybrid_opt.job.plan import plan_job
 from hybrid_opt.job.records import Job, sample_job
-from hybrid_opt.job.smooth import RESTS, acceleration_at_ends
 from hybrid_opt.store.bundle_file import MANIFEST, write_bundle
 from hybrid_opt.store.files import own_version, sha256
+from hybrid_opt.timing.jerk import RESTS, acceleration_at_ends
 from hybrid_opt.timing.records import Timing
 from symbolic.contact.registry import contact_model
 from symbolic.errors import SettingsError
@@ -81,13 +81,8 @@ class Origin:
 
     @classmethod
     def of_file(cls, path: Path, content: bytes, provenance: Mapping[str, Any]) -> Origin:
-        """Derive the origin of a trajectory file from its place in a results folder.
-
-        Args:
-            path: path of the file, such as RESULTS/selected/ALGORITHM/REPLICA.json.
-            content: content of the file.
-            provenance: provenance stored in the file.
-        """
+        """Derive the origin of a trajectory file from its place in a results folder, such as
+        RESULTS/selected/ALGORITHM/REPLICA.json, and from its content and provenance."""
         path = path.resolve()
         selected = len(path.parts) > 4 and path.parts[-3] == "selected"
         algorithm = path.parts[-2] if selected else provenance.get("algorithm")
@@ -138,16 +133,8 @@ def manifest(
     export: Export, name: str, target: Target, origin: Origin, skew: float | None
 ) -> dict[str, Any]:
     """Return the manifest of a target's bundle as JSON values: content, origin of the trajectory,
-    and limits.
-
-    Args:
-        export: the job at the target's time steps.
-        name: name of the target.
-        target: the target.
-        origin: origin of the carry.
-        skew: delay between the starts of both arms that the job has to tolerate [s]; None if not
-            checked.
-    """
+    and limits. `skew` is the delay between the starts of both arms that the job has to tolerate
+    [s]; None if not checked."""
     job, k = export.job, export.stiffness
     is_lost = bool(target.reaction and export.partner_stop.warning)
     step: dict[str, Any] = {"step": export.step}
@@ -215,12 +202,7 @@ def manifest(
 
 
 def readme(document: Mapping[str, Any], contents: Contents) -> str:
-    """Return the README of a bundle: its content, how to run it, and what stops the robots.
-
-    Args:
-        document: manifest of the bundle.
-        contents: contents of the bundle's files by path.
-    """
+    """Return the README of a bundle: its content, how to run it, and what stops the robots."""
     squeeze, machine = document["squeeze"], document["machine"]
     phases = [
         f"| {phase['name'].replace('_', ' ')} | {phase['begin']:.2f} | {phase['duration']:.2f} | "
@@ -266,12 +248,7 @@ def readme(document: Mapping[str, Any], contents: Contents) -> str:
 
 
 def warnings_of(job: Job) -> list[str]:
-    """Return sentences with warnings that an engineer should read before a job runs; empty for
-    none.
-
-    Args:
-        job: the job.
-    """
+    """Return sentences that an engineer should read before a job runs; empty for none."""
     cell, found = job.workcell, []
     peak, rated = job.peak_normal_force, cell.task.reference_force
     for robot, force, most in zip(cell.robots, peak, rated, strict=True):
@@ -395,15 +372,8 @@ def export(
 
 
 def prepared(job: Job, name: str, options: BundleOptions) -> Export:
-    """Sample a job for a bundle, at even time steps.
-
-    The step is the requested one. Without a request it is the longest one for which the pads'
-    forces between samples differ from the commanded ones by at most the share `TRACKED`.
-
-    Args:
-        job: the job.
-        name: name of the target, which states the possible time steps.
-        options: options of the bundle.
+    """Sample a job for a bundle at even time steps: the requested one, or the longest of the target
+    for which the pads' forces between samples are near enough to the commanded ones.
 
     Raises:
         SettingsError: the step is out of range, no step keeps the force error small enough, or the

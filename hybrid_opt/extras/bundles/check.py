@@ -72,6 +72,11 @@ CLOSED_CHAIN_CHANGE = 1e-3
 EXCESS = 1.005
 """A limit counts as exceeded if it is used beyond this ratio."""
 
+QUANTITIES = ("position", "velocity", "acceleration")
+
+Columns = tuple[Array, dict[tuple[str, str], Array]]
+"""Columns of a file: times (n,); positions, velocities and accelerations (n,) by quantity and name
+of the joint."""
 
 Mask = NDArray[np.bool_]
 
@@ -171,7 +176,6 @@ def read_trajectory(path: Path, workcell: Workcell) -> JointTrajectory:
 
     Args:
         path: path of the file: CSV, JSON (job.json, or a message of ROS 2), or YAML of ROS 2.
-        workcell: the cell.
 
     Raises:
         ResultsError: the file cannot be read, or lacks joints of the cell.
@@ -198,45 +202,26 @@ def read_trajectory(path: Path, workcell: Workcell) -> JointTrajectory:
         ) from error
 
 
-QUANTITIES = ("position", "velocity", "acceleration")
-
-Columns = tuple[Array, dict[tuple[str, str], Array]]
-"""Columns of a file: times (n,); positions, velocities and accelerations (n,) by quantity and name
-of the joint."""
-
-
 def _csv_columns(text: str) -> tuple[Columns, tuple[float, float] | None]:
-    """Read the columns of a CSV file with joint positions.
+    """Read the columns of a CSV file with joint positions, and the first and last time [s] at which
+    its column `phase` is 'carry'; None if no row has this phase."""
+    rows = list(csv.DictReader(io.StringIO(text)))
+    titles = {re.sub(r"\s*\[.*\]$", "", title).strip(): title for title in rows[0]}
+    (at,) = (word for word in titles if word.lower() in ("time", "t"))
 
-    Args:
-        text: text of the file.
-
-    Returns:
-        - Times (n,) [s], and the columns (n,) by quantity and joint name.
-        - First and last time [s] at which the column `phase` is 'carry'; None if no row has this
-          phase.
-    """
-    rows = list(csv.reader(io.StringIO(text)))
-    header, body = rows[0], [row for row in rows[1:] if row]
-    words = [re.sub(r"\s*\[.*\]$", "", name).strip() for name in header]
-    (at,) = (k for k, word in enumerate(words) if word.lower() in ("time", "t"))
-
-    def column(k: int) -> Array:
-        return np.array([float(row[k]) for row in body])
+    def column(word: str) -> Array:
+        return np.array([float(row[titles[word]]) for row in rows])
 
     found: dict[tuple[str, str], Array] = {}
-    for k, word in enumerate(words):
+    for word in titles:
         name, _, what = word.rpartition(" ")
         if what in QUANTITIES:
-            found[what, name] = column(k)
-        elif not name and k != at and what != "phase":
-            found["position", what] = column(k)
-    time, carry = column(at), None
-    if "phase" in words:
-        phase = words.index("phase")
-        carried = [t for t, row in zip(time.tolist(), body, strict=True) if row[phase] == "carry"]
-        carry = (carried[0], carried[-1]) if carried else None
-    return (time, found), carry
+            found[what, name] = column(word)
+        elif not name and word not in (at, "phase"):
+            found["position", what] = column(word)
+    time, phase = column(at), titles.get("phase", "")
+    carried = [t for t, row in zip(time.tolist(), rows, strict=True) if row.get(phase) == "carry"]
+    return (time, found), (carried[0], carried[-1]) if carried else None
 
 
 def _document_columns(document: Any) -> Columns:
@@ -263,13 +248,8 @@ def _document_columns(document: Any) -> Columns:
 
 
 def _chosen(columns: Columns, workcell: Workcell) -> JointTrajectory:
-    """Select the joints of a cell from the columns of a file.
-
-    A joint may be named ROBOT/JOINT, by its name in ROS, or plainly if the plain name is unique.
-
-    Args:
-        columns: times (n,) [s], and columns (n,) by quantity and joint name.
-        workcell: the cell.
+    """Select the joints of a cell from the columns of a file. A joint may be named ROBOT/JOINT, by
+    its name in ROS, or plainly if the plain name is unique.
 
     Raises:
         ValueError: a joint is missing, or times or values are not valid.
@@ -317,8 +297,6 @@ def check(
     and normal forces.
 
     Args:
-        cell: the cell.
-        trajectory: the trajectory.
         held: first and last time at which the pads hold the box [s]. None for the times that the
             file states; if it states none, the longest run of samples at which the pads are near
             their planned positions relative to each other.
@@ -377,14 +355,8 @@ def check(
 
 
 def _places(time: Array) -> Array:
-    """Insert further times between the times of n samples.
-
-    Args:
-        time: (n,) ascending times of the samples [s].
-
-    Returns:
-        (k,) ascending times [s]: those of the samples and, in each step between two of them, those
-        at the shares `BETWEEN` of the step.
+    """Return ascending times [s]: those of the n samples, and in each step between two samples the
+    times at the shares `BETWEEN` of the step.
     """
     steps = np.diff(time)
     inside = [time[:-1] + share * steps for share in (0.0, *BETWEEN)]
@@ -393,13 +365,8 @@ def _places(time: Array) -> Array:
 
 def _load(cell: Cell) -> NumericFunction:
     """Return the compiled function that computes the contact forces from pose, velocity and
-    acceleration of the box.
-
-    A timing model has this function too, but would also load a compiled solver, which is not used
-    here.
-
-    Args:
-        cell: the cell.
+    acceleration of the box. A timing model has this function too, but would also load a compiled
+    solver.
     """
 
     def make(model: CellModel) -> Mapping[str, ca.Function]:
@@ -411,12 +378,8 @@ def _load(cell: Cell) -> NumericFunction:
 
 
 def _certificate(cell: Cell, joints: BPoly, time: Array) -> str:
-    """Prove that the motion of both arms and box is free of collisions.
-
-    Args:
-        cell: the cell.
-        joints: polynomials of both arms' joint positions over time.
-        time: (n,) times of the samples, first to last of the proof [s].
+    """Prove that the motion of both arms and box is free of collisions from the first to the last
+    of the times (n,) [s]. `joints` are polynomials of both arms' joint positions.
 
     Returns:
         The first colliding pair and its time as text; '' if the motion is proven free.
@@ -437,15 +400,11 @@ def _certificate(cell: Cell, joints: BPoly, time: Array) -> str:
 
 
 def _held(along: Array, across: Array) -> Mask:
-    """Find the longest run of samples at which both pads are near their planned positions relative
-    to each other.
-
-    Args:
-        along: (n,) distance between the pads along the normal, minus the planned distance [m].
-        across: (n,) displacement of the second pad across the normal [m].
+    """Find the longest run of at least `SHORTEST` samples at which both pads are near their planned
+    positions relative to each other. `along` and `across` are the results of `pad_errors`.
 
     Returns:
-        (n,) True for samples of this run; False everywhere if no run has `SHORTEST` samples.
+        (n,) True for samples of this run; False everywhere if there is none.
     """
     near = (np.abs(along) < TOUCHING) & (across < TOUCHING)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], near.astype(int), [0]])))
@@ -459,13 +418,9 @@ def _held(along: Array, across: Array) -> Mask:
 
 
 def _poses(workcell: Workcell, q: Array) -> Array:
-    """Compute the box poses (n, 6) [m, rad] if the first arm's pad keeps its position on the box.
-    The last three numbers are angles or a rotation vector, as in the cell's task.
-
-    Args:
-        workcell: the cell.
-        q: (n, joints) joint positions of both arms side by side [rad or m].
-    """
+    """Compute the box poses (n, 6) [m, rad] if the first arm's pad keeps its position on the box,
+    from joint positions (n, joints) of both arms side by side. The last three numbers are angles or
+    a rotation vector, as in the cell's task."""
     T_pad_box = inverse(workcell.contacts[0].T_box_pad)
     T = pad_places(workcell, 0, joints_of(workcell, q)[0]) @ T_pad_box
     orientation = workcell.task.orientation
@@ -482,11 +437,7 @@ def _most(values: Array, limit: float) -> float:
 
 
 def as_document(finding: Finding) -> Mapping[str, Any]:
-    """Convert the result of a check to JSON values.
-
-    Args:
-        finding: the result.
-    """
+    """Convert the result of a check to JSON values."""
     return {
         "duration": finding.duration,
         "interpolation": finding.interpolation,

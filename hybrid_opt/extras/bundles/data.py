@@ -26,15 +26,8 @@ SCHEMA = "job.schema.json"
 
 
 def data_files(export: Export) -> dict[str, str | bytes]:
-    """Return the data files of a job: a table, a JSON file with its schema, and a recording for ROS
-    2.
-
-    Args:
-        export: the job at the target's time steps.
-
-    Returns:
-        Contents of the files by path.
-    """
+    """Return the data files of a job by path: a table, a JSON file with its schema, and a recording
+    for ROS 2."""
     schema = (files("hybrid_opt.extras.bundles") / SCHEMA).read_text("utf-8")
     tables = {"job.csv": job_table(export), "job.json": job_text(export), SCHEMA: schema}
     return tables | recording(export)
@@ -48,11 +41,7 @@ _JOINT_UNITS = (("rad", "m"), ("rad/s", "m/s"), ("rad/s^2", "m/s^2"), ("N m", "N
 
 def job_table(export: Export) -> str:
     """Return the job as a CSV table with one row per time step, and one column per quantity with
-    its unit.
-
-    Args:
-        export: the job at the target's time steps.
-    """
+    its unit."""
     job, sampled = export.job, export.sampled
     robots = [robot.name for robot in job.workcell.robots]
     pose = zip(job.workcell.task.pose_names, _POSE_UNITS, strict=True)
@@ -90,14 +79,8 @@ RECORDED = (
 
 
 def recording(export: Export) -> dict[str, str | bytes]:
-    """Return the files of a ROS 2 recording of a job. Its time stamps begin at zero.
-
-    Args:
-        export: the job at the target's time steps.
-
-    Returns:
-        Contents by path; without the extra `ros`, only a note that says what to install.
-    """
+    """Return the files of a ROS 2 recording of a job by path, its time stamps from zero; without
+    the extra `ros`, only a note that says what to install."""
     try:
         from mcap.writer import Writer
         from rosbags.typesys import Stores, get_typestore
@@ -124,14 +107,8 @@ def recording(export: Export) -> dict[str, str | bytes]:
 
 
 def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, str, Any]]:
-    """Yield the ROS messages of every sample of a job.
-
-    Args:
-        export: the job at the target's time steps.
-        types: ROS message classes by name.
-
-    Yields:
-        Time [ns], topic and message.
+    """Yield time [ns], topic and message of every sample. `types` has the ROS message classes by
+    name.
     """
     sampled, cell, joined = export.sampled, export.workcell, prefixes(export.workcell)
     joints = ros_joints(cell)
@@ -149,11 +126,7 @@ def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, s
 
     def frames(k: int) -> Iterator[tuple[str, Array]]:
         """Yield the name of each frame and its pose (4, 4) in the world: the box, every link of
-        both arms, and both pads.
-
-        Args:
-            k: index of the sample.
-        """
+        both arms, and both pads."""
         yield "box", boxes[k]
         for arm, robot in enumerate(cell.robots):
             model, found, prefix = models[arm], data[arm], joined[arm]
@@ -171,12 +144,8 @@ def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, s
     poses = np.concatenate([T[..., :3, 3], turns.reshape(*T.shape[:2], 4)], axis=2).tolist()
 
     def placed(kind: str, pose: list[float]) -> tuple[Any, Any]:
-        """Convert a pose to two ROS messages: the position, and the quaternion.
-
-        Args:
-            kind: type of the position's message in `geometry_msgs`.
-            pose: position [m], then the quaternion x, y, z, w.
-        """
+        """Convert a pose, position [m] and quaternion x, y, z, w, to two ROS messages; `kind` is
+        the position's type in `geometry_msgs`."""
         turn = of("geometry_msgs/Quaternion", *pose[3:])
         return of(f"geometry_msgs/{kind}", *pose[:3]), turn
 
@@ -216,12 +185,7 @@ def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, s
 
 def pad_wrench(sampled: SampledJob, arm: int) -> Array:
     """Compute the force and moment (n, 6) [N, N m] that a robot's pad exerts on the box, about the
-    pad's centre along the pad's axes.
-
-    Args:
-        sampled: the job at n samples.
-        arm: index of the robot.
-    """
+    pad's centre along the pad's axes."""
     T_box_pad = sampled.job.workcell.contacts[arm].T_box_pad
     turned = box_rotation(sampled.job.workcell.task.orientation, sampled.pose)
     R_world_pad = turned @ T_box_pad[:3, :3]

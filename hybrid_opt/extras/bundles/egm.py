@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -42,15 +41,12 @@ UNKNOWN_TOOL_MASS = 0.1
 
 
 def require_egm(workcell: Workcell, leader: int) -> None:
-    """Check that a cell's force-controlled arm has force control on its controller, and that the
-    cell states the delay of each arm.
+    """Check that a cell states the delay of each arm, and that the controller of its
+    force-controlled arm has force control.
 
     Args:
         workcell: the cell.
-        leader: index of the arm that keeps its position; the other one is force-controlled.
-
-    Raises:
-        SettingsError: force control is missing or the delay of an arm is unknown.
+        leader: index of the position-controlled arm.
     """
     robots = workcell.robots
     robot, other = robots[1 - leader], robots[leader]
@@ -76,48 +72,13 @@ def require_egm(workcell: Workcell, leader: int) -> None:
 
 
 def tasks_of(export: Export) -> tuple[str, str]:
-    """Return the name of each arm's RAPID task on the controller, for the first and the second arm.
-
-    Args:
-        export: the job.
-    """
+    """Return the name of each arm's RAPID task on the controller."""
     two_armed = all(len(joints) == SEVEN for joints in export.job.joint_names)
     return TWO_ARMED_TASKS if two_armed else TASKS
 
 
-def _checked_start(joints: int) -> Iterator[str]:
-    """Yield the lines of a RAPID procedure that ends the program if the arm is not at the first
-    position of the job.
-
-    The procedure does not move the arm there, because such a move would not be checked for
-    collisions.
-
-    Args:
-        joints: number of joints of the arm.
-    """
-    axes = [f"robax.rax_{axis}" for axis in range(1, SIX + 1)]
-    axes += ["extax.eax_a"] if joints == SEVEN else []
-    yield "  PROC CarryCheckStart()"
-    yield "    VAR jointtarget here;"
-    yield "    here := CJointT();"
-    for joint in axes:
-        yield f"    IF Abs(here.{joint} - carryFirst.{joint}) > {START_TOLERANCE:g} THEN"
-        yield '      TPWrite "Carry: jog the robot to carryFirst, pads away from the box.";'
-        # After Stop, a press of Start would go on behind the check.
-        yield "      EXIT;"
-        yield "    ENDIF"
-    yield "  ENDPROC"
-    yield ""
-
-
 def _tool(export: Export, arm: int) -> str:
-    """Return RAPID's tooldata of an arm: the pad's frame on the flange, and the load of the tool if
-    the workcell states it.
-
-    Args:
-        export: the job.
-        arm: index of the arm.
-    """
+    """Return RAPID's tooldata of an arm: the pad's frame on the flange, and the tool's load."""
     robot = export.workcell.robots[arm]
     frame = _frame(robot.T_flange_pad)
     if robot.tool_load is None:
@@ -128,13 +89,8 @@ def _tool(export: Export, arm: int) -> str:
 
 
 def _load(mass: float, centre: Array, inertia: Array) -> str:
-    """Return RAPID's loaddata of a load.
-
-    Args:
-        mass: mass [kg].
-        centre: (3,) centre of mass [mm].
-        inertia: (3,) principal moments of inertia [kg m^2].
-    """
+    """Return RAPID's loaddata: mass [kg], centre (3,) [mm], principal moments of inertia (3,) [kg
+    m^2]."""
     return f"[{mass:.4f},{_numbers(centre)},[1,0,0,0],{_numbers(inertia)[1:-1]}]"
 
 
@@ -177,15 +133,8 @@ seems to limit the speed itself."""
 
 
 def egm_files(export: Export) -> dict[str, str | bytes]:
-    """Return the files of the target `abb-egm`: the program that streams the job, and the RAPID
-    code that starts EGM in the tasks of both arms.
-
-    Args:
-        export: the job at the target's time steps.
-
-    Returns:
-        Contents of the files by path.
-    """
+    """Return the files of the target `abb-egm` by path: the program that streams the job, and the
+    RAPID code that starts EGM in the tasks of both arms."""
     robots, follower, q = export.workcell.robots, export.follower, export.sampled.q
     J = pad_jacobians(export.workcell, follower, export.sampled.arm(follower, q))
     # Along the pad's normal, without turning it.
@@ -224,6 +173,8 @@ def egm_files(export: Export) -> dict[str, str | bytes]:
 def _egm_module(export: Export, arm: int) -> str:
     robot, q = export.workcell.robots[arm], export.sampled.arm(arm, export.sampled.q)
     axes = range(1, SIX + 1)
+    joints = [f"robax.rax_{axis}" for axis in axes]
+    joints += ["extax.eax_a"] if q.shape[1] == SEVEN else []
     fastest = float(np.rad2deg(np.abs(export.sampled.arm(arm, export.sampled.q_rate)).max()))
     text = filled(
         "carry_egm.mod",
@@ -233,7 +184,9 @@ def _egm_module(export: Export, arm: int) -> str:
         task=tasks_of(export)[arm],
         tool=_tool(export, arm),
         first=_target(np.rad2deg(q[0])),
-        check="\n".join(_checked_start(q.shape[1])),
+        away="\n        OR ".join(
+            f"Abs(here.{joint} - carryFirst.{joint}) > {START_TOLERANCE:g}" for joint in joints
+        ),
         criteria=" ".join(f"\\J{axis}:=carryClose" for axis in axes),
         moved=" ".join(f"\\J{axis}" for axis in axes),
         deviation=math.ceil(DEVIATION * fastest),

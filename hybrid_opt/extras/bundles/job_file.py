@@ -25,6 +25,7 @@ import numpy as np
 import pinocchio as pin
 from scipy.interpolate import BPoly
 
+from hybrid_opt.carry import joints_of
 from hybrid_opt.compiled_cell import CACHED_WORKCELLS
 from hybrid_opt.errors import JobError
 from hybrid_opt.extras.bundles.arms import prefixes
@@ -84,17 +85,11 @@ class Gap:
 def chosen_step(
     job: Job, steps: Sequence[float], interpolation: Interpolation, stiffness: float
 ) -> float:
-    """Return the longest time step for which the normal forces stay near the commanded ones between
-    samples [s].
+    """Return the longest time step [s] with which the normal forces stay near the commanded ones
+    between samples.
 
     Between two samples the distance of the pads changes, and with it the normal forces. A step is
     accepted if this error is at most the share `TRACKED` of the least commanded force.
-
-    Args:
-        job: the job.
-        steps: time steps that the target supports, the longest first [s].
-        interpolation: kind of interpolation between two samples.
-        stiffness: stiffness of each arm at its pad [N/m].
 
     Raises:
         SettingsError: the error is too large with every step.
@@ -113,13 +108,7 @@ def chosen_step(
 
 
 def gap_of(sampled: SampledJob, interpolation: Interpolation, stiffness: float) -> Gap:
-    """Compute how far the pads deviate from their planned poses between the samples of a job.
-
-    Args:
-        sampled: the job at given time steps.
-        interpolation: kind of interpolation between two samples.
-        stiffness: stiffness of each arm at its pad [N/m].
-    """
+    """Compute how far the pads deviate from their planned poses between the samples of a job."""
     job, time = sampled.job, sampled.time
     spans = [sampled.span(job.phases.index(phase)) for phase in job.held]
     starts = np.concatenate([np.arange(span.start, span.stop - 1) for span in spans])
@@ -142,19 +131,14 @@ def gap_of(sampled: SampledJob, interpolation: Interpolation, stiffness: float) 
 
 
 def between(time: Array, known: Sequence[Array], interpolation: Interpolation) -> BPoly:
-    """Interpolate joint positions between samples as a controller does.
-
-    In each time step this is the polynomial of least degree that has the given positions and
-    derivatives at both ends.
+    """Interpolate joint positions between samples as a controller does: by the polynomial of least
+    degree that has the given positions and derivatives at both ends of a time step.
 
     Args:
         time: (n,) ascending times [s].
         known: arrays (n, joints) of positions [rad or m], then velocities, then accelerations [per
             s, per s^2]. Arrays that the interpolation does not use are ignored.
         interpolation: kind of interpolation.
-
-    Returns:
-        The piecewise polynomial of time, with values (joints,).
     """
     taken = np.stack(known[: DERIVATIVES[interpolation]], axis=1)
     return BPoly.from_derivatives(time, taken)
@@ -164,16 +148,13 @@ def pad_errors(workcell: Workcell, q: Array) -> tuple[Array, Array]:
     """Compute how far the second pad is from its planned position relative to the first pad.
 
     Args:
-        workcell: the cell.
         q: (n, joints) joint positions of both arms side by side [rad or m].
 
     Returns:
-        - Distance (n,) between the pads along the first pad's normal, minus the planned distance
-          [m].
-        - Displacement (n,) across this normal, at least zero [m].
+        Distance (n,) between the pads along the first pad's normal, minus the planned distance [m];
+        and displacement (n,) across this normal, at least zero [m].
     """
-    first = len(workcell.robots[0].torque_max)
-    T = [pad_places(workcell, arm, own) for arm, own in enumerate((q[:, :first], q[:, first:]))]
+    T = [pad_places(workcell, arm, own) for arm, own in enumerate(joints_of(workcell, q))]
     apart = np.einsum("nji,nj->ni", T[0][:, :3, :3], T[1][:, :3, 3] - T[0][:, :3, 3])
     one, other = (contact.T_box_pad for contact in workcell.contacts)
     missed = apart - one[:3, :3].T @ (other[:3, 3] - one[:3, 3])
@@ -181,12 +162,8 @@ def pad_errors(workcell: Workcell, q: Array) -> tuple[Array, Array]:
 
 
 def pad_places(workcell: Workcell, arm: int, q: Array) -> Array:
-    """Compute the poses (n, 4, 4) of an arm's pad in the world.
-
-    Args:
-        workcell: the cell.
-        arm: index of the arm.
-        q: (n, n_joints) joint positions of this arm [rad or m].
+    """Compute the poses (n, 4, 4) of an arm's pad in the world at joint positions q (n, n_joints)
+    of this arm [rad or m].
     """
     robot = workcell.robots[arm]
     model = build_robot_model(robot)
@@ -199,13 +176,7 @@ def pad_places(workcell: Workcell, arm: int, q: Array) -> Array:
 
 def pad_jacobians(workcell: Workcell, arm: int, q: Array) -> Array:
     """Compute the Jacobians (n, 6, n_joints) of an arm's pad: linear, then angular velocity along
-    the flange's axes per joint velocity [m/rad, 1].
-
-    Args:
-        workcell: the cell.
-        arm: index of the arm.
-        q: (n, n_joints) joint positions of this arm [rad or m].
-    """
+    the flange's axes per joint velocity [m/rad, 1], at joint positions q (n, n_joints)."""
     robot, found = workcell.robots[arm], np.empty((len(q), 6, q.shape[1]))
     model = build_robot_model(robot)
     data = model.model.createData()
@@ -350,30 +321,19 @@ class Export:
         return self.sampled.effort + self._of_other(self._contact(self.sampled.wrench))
 
     def _contact(self, wrench: Array) -> Array:
-        """Compute the joint torques (n, joints) with which both arms exert their wrenches on the
-        box [N m, for sliding joints N].
-
-        Args:
-            wrench: (n, 2, 6) wrench of each arm on the box [N, N m].
-        """
+        """Compute the joint torques (n, joints) with which both arms exert their wrenches (n, 2, 6)
+        on the box [N m, for sliding joints N]."""
         sampled, model = self.sampled, timing_model(self.workcell)
         matrices = model.wrench_torque(np.ascontiguousarray(sampled.q), sampled.pose)
         first = len(self.job.joint_names[0])
         return contact_torque(first, matrices, np.swapaxes(wrench, 0, 1))
 
     def _of_other(self, contact: Array) -> Array:
-        """Exchange the torques of the two arms' contacts in joints that move both arms.
+        """Return the torques (n, joints) that the other arm's contact causes in each joint; zero in
+        joints that move one arm only.
 
-        Such a joint, for instance a torso, has one column per arm. Each of its two columns gets the
-        torque that the other arm's contact causes in the joint.
-
-        Args:
-            contact: (n, joints) torques by each arm's own contact, both arms side by side [N m, for
-                sliding joints N].
-
-        Returns:
-            (n, joints) torques [N m, for sliding joints N]; zero in the columns of all joints that
-            move one arm only.
+        A joint that moves both, for instance a torso, has one column per arm. `contact` (n, joints)
+        are the torques by each arm's own contact.
         """
         found, (own, other) = np.zeros_like(contact), self.job.joint_names
         for name in common_joints(self.workcell.robots):
@@ -383,10 +343,9 @@ class Export:
 
     @property
     def joint_columns(self) -> dict[str, Array]:
-        """Arrays (n, joints) by name, with the joints of both arms side by side.
-
-        They are joint positions [rad or m], velocities and accelerations [per s, per s^2], and
-        torques with and without gravity [N m, for sliding joints N].
+        """Arrays (n, joints) of both arms side by side, by name: joint positions [rad or m],
+        velocities and accelerations [per s, per s^2], and torques with and without gravity [N m,
+        for sliding joints N].
         """
         sampled = self.sampled
         return {
@@ -430,11 +389,8 @@ class Export:
 
     @cached_property
     def partner_stop(self) -> PartnerStop:
-        """Effect of an unplanned stop of one arm on the distance of the pads.
-
-        Raises:
-            JobError: the pads would move farther apart than the cell allows.
-        """
+        """Effect of an unplanned stop of one arm on the distance of the pads; a JobError if they
+        would move farther apart than the cell allows."""
         job, k, time = self.job, self.stiffness, self.limits.partner_stop_time
         survived = None if k is None else separation(job, largest_skew(job, k, time))
         allowed = self.workcell.handling.partner_stop
@@ -450,31 +406,20 @@ class Export:
         return found
 
     def reach(self, arm: int) -> Array:
-        """Compute the largest speed of an arm's pad per speed of each joint, over all samples.
-
-        Args:
-            arm: index of the arm.
-
-        Returns:
-            (n_joints,) one value for each joint of the arm [m/rad, for sliding joints 1].
+        """Compute for each joint of an arm the largest speed of the pad per speed of this joint,
+        over all samples: (n_joints,) [m/rad, for sliding joints 1].
         """
         J = pad_jacobians(self.workcell, arm, self.sampled.arm(arm, self.sampled.q))
         return np.asarray(np.linalg.norm(J[:, :3], axis=1).max(axis=0))
 
     def ros_joints(self, arm: int) -> list[str]:
-        """Return the names of an arm's joints in ROS, with its robot's prefix, base first.
-
-        Args:
-            arm: index of the arm.
-        """
+        """Return the names of an arm's joints in ROS, with its robot's prefix, base first."""
         prefix = prefixes(self.workcell)[arm]
         return [f"{prefix}{joint}" for joint in self.job.joint_names[arm]]
 
     @cached_property
     def document(self) -> dict[str, Any]:
-        """Content of job.json as JSON values by key: times, phases, box poses, limits, and the
-        values of each robot.
-        """
+        """Content of job.json as JSON values, as `job.schema.json` describes it."""
         sampled, job = self.sampled, self.job
         orientation = self.workcell.task.orientation
         spans = map(sampled.span, range(len(job.phases)))
@@ -517,19 +462,11 @@ class Export:
 
     def tool_load(self, arm: int) -> tuple[float, Array]:
         """Return the mass [kg] and the centre of mass (3,) in the flange frame [m] of an arm's
-        tool; zeros if unknown.
-
-        Args:
-            arm: index of the arm.
-        """
+        tool; zeros if unknown."""
         load = self.workcell.robots[arm].tool_load
         return (0.0, np.zeros(3)) if load is None else (load.mass, load.centre_of_mass)
 
 
 def job_text(export: Export) -> str:
-    """Return the text of job.json.
-
-    Args:
-        export: the job at the target's time steps.
-    """
+    """Return the text of job.json."""
     return json.dumps(export.document, allow_nan=False, separators=(",", ":")) + "\n"

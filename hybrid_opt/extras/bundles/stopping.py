@@ -47,11 +47,7 @@ class Stop:
 
 def stop_of(job: Job, model: TimingModel) -> Stop:
     """Find the shortest stop along the path that the commanded forces allow at every point of a
-    job.
-
-    Args:
-        job: the job.
-        model: timing model of its workcell.
+    job, by the timing model of its workcell.
 
     Raises:
         JobError: the commanded forces allow no stop of the tried durations.
@@ -70,12 +66,9 @@ def stop_of(job: Job, model: TimingModel) -> Stop:
     places, x = time[::STOP_STRIDE], np.linspace(0.0, 1.0, INSTANTS)
 
     def stop(duration: float) -> Stop:
-        """Simulate stops along the path that begin at many points of it. Return the largest normal
-        force and joint acceleration of all these stops, as shares of the commanded force and of the
-        limit.
-
-        Args:
-            duration: duration of each stop [s].
+        """Simulate stops of a given duration [s] that begin at many points of the path. Return the
+        largest normal force and joint acceleration of all these stops, as shares of the commanded
+        force and of the limit.
         """
         rate = 1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
         slope = -30.0 * x**2 * (1.0 - x) ** 2 / duration

@@ -32,8 +32,9 @@ from symbolic.contact.registry import contact_model, require_squeeze
 from symbolic.errors import SettingsError
 from symbolic.records import Workcell
 
-SKEW = 0.01
-"""Largest expected delay between the starts of two controllers with separate clocks [s]."""
+SKEW, CYCLE_SKEW = 0.01, 0.002
+"""Largest expected delay between the starts of two controllers [s]: with separate clocks, and of
+drivers with the same start time in their goals, one cycle."""
 
 
 @dataclass(frozen=True)
@@ -77,30 +78,35 @@ class Target:
     lines: Lines | None = None
     stiffness: str = ""
 
-    def refuse(self, job: Job, name: str, any_arm: bool) -> None:
-        """Check, before a job is sampled, that this target can run it.
-
-        Args:
-            job: the job.
-            name: name of the target, for messages.
-            any_arm: True to accept arms that do not look like those of the target's maker.
-
-        Raises:
-            SettingsError: the arms are not of the target's maker, or lack something that it needs.
-        """
-        self.require_hands(job.workcell, name)
-        if self.maker:
-            needs = (self.maker, self.axes, self.has_address)
-            require_arms(job.workcell, name, *needs, any_arm=any_arm)
-        self.require_equipment(job.workcell, job.squeeze.leader)
-        self.require(job)
-
-    def require_hands(self, workcell: Workcell, name: str) -> None:
-        """Check that this target can switch the hands of a cell (cups, magnets or grippers).
+    def checks(
+        self, workcell: Workcell, name: str, leader: int, any_arm: bool = False
+    ) -> list[Callable[[], object]]:
+        """Return functions each of which raises a SettingsError if a cell is not for this target:
+        its hands, the maker and joints of its arms, their addresses, and their equipment.
 
         Args:
             workcell: the cell.
             name: name of the target, for messages.
+            leader: index of the position-controlled arm.
+            any_arm: True to accept arms that do not look like those of the target's maker.
+        """
+        arms = partial(require_arms, workcell, name, self.maker, self.axes, any_arm=any_arm)
+        found: list[Callable[[], object]] = [partial(self.require_hands, workcell, name)]
+        found += [arms, partial(arms, has_address=self.has_address)] if self.maker else []
+        return [*found, partial(self.require_equipment, workcell, leader)]
+
+    def refuse(self, job: Job, name: str, any_arm: bool) -> None:
+        """Check, before a job is sampled, that this target can run it, by `checks` and `require`.
+
+        Raises:
+            SettingsError: the arms are not of the target's maker, or lack something that it needs.
+        """
+        for check in self.checks(job.workcell, name, job.squeeze.leader, any_arm):
+            check()
+        self.require(job)
+
+    def require_hands(self, workcell: Workcell, name: str) -> None:
+        """Check that this target can switch the hands of a cell (cups, magnets or grippers).
 
         Raises:
             SettingsError: the target switches no hands, or the names of their outputs are not valid
@@ -117,13 +123,6 @@ class Target:
         """Return the stiffness of each arm at its pad for a job [N/m]; None if the target needs
         none.
 
-        Both arms hold the box like springs in series, so their stiffnesses k_1 and k_2 are averaged
-        to 2 / (1 / k_1 + 1 / k_2).
-
-        Args:
-            job: the job.
-            name: name of the target, for messages.
-
         Raises:
             SettingsError: the target needs a stiffness that is unknown.
         """
@@ -132,12 +131,11 @@ class Target:
         return self.stated_stiffness(job.workcell, name)
 
     def stated_stiffness(self, workcell: Workcell, name: str) -> float | None:
-        """Return the stiffness of each arm at its pad that a cell states [N/m]: the mean
-        2 / (1 / k_1 + 1 / k_2) of both arms. None if one is not stated and the target needs none.
+        """Return the stiffness of each arm at its pad that a cell states [N/m]; None if one is not
+        stated and the target needs none.
 
-        Args:
-            workcell: the cell.
-            name: name of the target, for messages.
+        Both arms hold the box like springs in series, so their stiffnesses k_1 and k_2 are averaged
+        to 2 / (1 / k_1 + 1 / k_2).
 
         Raises:
             SettingsError: the target needs a stiffness that is unknown.
@@ -158,21 +156,15 @@ class Target:
         )
 
 
-RUN = "run_job.py looks at both arms a hundred times a second and replaces their goals"
-
-
-CYCLE_SKEW = 0.002
-"""Largest delay between the starts of two drivers with the same start time in their goals, one
-cycle [s]."""
-
+_RUN = "python3 run_job.py --bring-up without a box, then python3 run_job.py"
 
 _TORQUE = Target(
     torque_files,
     TORQUE_STEPS,
     "quintic",
     "start your simulator with description/cell.urdf, ros2 launch launch/simulation.launch.py, "
-    "python3 run_job.py --bring-up without a box, then python3 run_job.py",
-    RUN,
+    + _RUN,
+    "run_job.py looks at both arms a hundred times a second and replaces their goals",
     "one controller drives all joints: both arms start in the same cycle",
     0.0,
     require=require_torque,
@@ -192,8 +184,7 @@ TORQUE_DRIVERS: Mapping[str, Target] = {
     "simulation": _TORQUE,
     "franka": replace(
         _DRIVEN,
-        how_to_run="no end effector in Desk; ros2 launch launch/franka.launch.py, python3 "
-        "run_job.py --bring-up without a box, then python3 run_job.py",
+        how_to_run=f"no end effector in Desk; ros2 launch launch/franka.launch.py, {_RUN}",
     ),
     "ur": replace(
         _DRIVEN,
@@ -203,8 +194,7 @@ TORQUE_DRIVERS: Mapping[str, Target] = {
             "the number of a digital line, 0 to 17, or by services and topics of ROS, /NAME each",
         ),
         how_to_run="PolyScope 5.25.1 or 10.12.1, no TCP offset; power both arms on and release "
-        "their brakes; ros2 launch launch/ur.launch.py, python3 run_job.py --bring-up without a "
-        "box, then python3 run_job.py",
+        f"their brakes; ros2 launch launch/ur.launch.py, {_RUN}",
     ),
 }
 """The torque target of each driver, by the driver's name."""
@@ -276,9 +266,6 @@ GONE = {
 def require_target(name: str) -> None:
     """Check that a target exists.
 
-    Args:
-        name: name of the target.
-
     Raises:
         SettingsError: the name is unknown, or the target is no longer written.
     """
@@ -295,10 +282,6 @@ def require_target(name: str) -> None:
 def target_for(name: str, workcell: Workcell) -> Target:
     """Return a target by name, in the variant for the drivers of the cell's arms.
 
-    Args:
-        name: name of the target.
-        workcell: the cell.
-
     Raises:
         SettingsError: the name is unknown, or no driver takes torques for these arms.
     """
@@ -311,8 +294,6 @@ def missing_for(name: str, workcell: Workcell, leader: int = 0) -> tuple[str, ..
     empty if nothing.
 
     Args:
-        name: name of the target.
-        workcell: the cell.
         leader: index of the position-controlled arm.
 
     Raises:
@@ -323,14 +304,9 @@ def missing_for(name: str, workcell: Workcell, leader: int = 0) -> tuple[str, ..
         found = target_for(name, workcell)
     except SettingsError as error:
         return (str(error),)
-    arms = partial(require_arms, workcell, name, found.maker, found.axes)
-    checks: list[Callable[[], object]] = [arms] if found.maker else []
-    checks += [partial(arms, has_address=True)] if found.maker and found.has_address else []
-    checks += [partial(found.require_equipment, workcell, leader)]
-    checks += [partial(found.require_hands, workcell, name)]
-    checks += (
-        [partial(found.stated_stiffness, workcell, name)] if found.stiffness != "gains" else []
-    )
+    checks = found.checks(workcell, name, leader)
+    if found.stiffness != "gains":
+        checks.append(partial(found.stated_stiffness, workcell, name))
     problems = list[str]()
     for check in checks:
         try:
@@ -341,11 +317,7 @@ def missing_for(name: str, workcell: Workcell, leader: int = 0) -> tuple[str, ..
 
 
 def missing_loads(workcell: Workcell) -> list[str]:
-    """Return a warning for each robot whose tool load is not stated; empty if all are.
-
-    Args:
-        workcell: the cell.
-    """
+    """Return a warning for each robot whose tool load is not stated; empty if all are."""
     return [
         f"no tool_load is given for {robot.name}: torques and tool data leave out the pad's mass"
         for robot in workcell.robots
@@ -355,10 +327,6 @@ def missing_loads(workcell: Workcell) -> list[str]:
 
 def missing_text(name: str, workcell: Workcell) -> str:
     """Return a text for a terminal on what a cell lacks for a target.
-
-    Args:
-        name: name of the target.
-        workcell: the cell.
 
     Raises:
         SettingsError: the target is unknown.

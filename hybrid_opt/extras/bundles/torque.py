@@ -87,9 +87,6 @@ def driver_of(workcell: Workcell) -> str:
     """Return the name of the driver for both arms: 'franka', 'ur', or 'simulation' if no arm has an
     address.
 
-    Args:
-        workcell: the cell.
-
     Raises:
         SettingsError: only one arm has an address, or no driver takes torques for these arms.
     """
@@ -116,13 +113,8 @@ def driver_of(workcell: Workcell) -> str:
 
 
 def require_torque(job: Job) -> None:
-    """Check, for Franka arms, that the names of the joints are those that franka_ros2 uses.
-
-    Args:
-        job: the job.
-
-    Raises:
-        SettingsError: the names differ, or a prefix does not end with '_'.
+    """Check, for Franka arms, that the joints have the names that franka_ros2 uses, and that
+    prefixes end with '_'.
     """
     if driver_of(job.workcell) != "franka":
         return
@@ -144,11 +136,7 @@ def require_torque(job: Job) -> None:
 
 def joint_stiffness(job: Job) -> Array:
     """Return the proportional gains (joints,) of the joint controllers, both arms side by side [N
-    m/rad, for sliding joints N/m].
-
-    Args:
-        job: the job.
-    """
+    m/rad, for sliding joints N/m]."""
     largest = job.workcell.stack_joint_limits("torque_max")
     return np.minimum(GAIN * largest, FASTEST**2 * joint_inertia(job))
 
@@ -171,46 +159,36 @@ def pad_stiffness(job: Job) -> float:
 
 
 def torque_files(export: Export) -> dict[str, str | bytes]:
-    """Return the files of the target `torque`: programs, controllers, and `config/cell.json` with
-    the settings of the driver.
-
-    Args:
-        export: the job at the target's time steps.
-
-    Returns:
-        Contents of the files by path.
+    """Return the files of the target `torque` by path: programs, controllers, and
+    `config/cell.json` with the settings of the driver.
 
     Raises:
         SettingsError: a torque changes faster than libfranka accepts.
     """
-    driver = driver_of(export.workcell)
+    driver, begin = driver_of(export.workcell), 0
+    config: dict[str, Any] = {}
+    files: dict[str, str | bytes] = {}
     if driver == "simulation":
-        joints = ros_joints(export.workcell)
-        files: dict[str, str | bytes] = {
-            "description/cell.urdf": description(export.workcell, export.sampled.q[0]),
-            "config/controllers.yaml": _controllers(export, driver, joints, {}),
-        }
-        known = [dict[str, Any]()]
+        files["description/cell.urdf"] = description(export.workcell, export.sampled.q[0])
+        known = [("", ros_joints(export.workcell), dict[str, Any]())]
     else:
-        known, files, begin = [], {}, 0
+        known, make = [], _franka if driver == "franka" else _ur
         for arm in (0, 1):
-            values, broadcasters = (_franka if driver == "franka" else _ur)(export, arm)
-            known.append(values)
             joints = {name: begin + k for k, name in enumerate(export.ros_joints(arm))}
             begin += len(joints)
-            text = _controllers(export, driver, joints, broadcasters)
-            files[f"config/controllers_{arm + 1}.yaml"] = text
-    config: dict[str, Any] = {}
-    for values in known:
-        for name, entries in json.loads(filled(f"cell_{driver}.json", **values)).items():
-            config[name] = config.get(name, []) + entries if isinstance(entries, list) else entries
+            known.append((f"_{arm + 1}", joints, make(export, arm)))
+    for number, joints, values in known:
+        cell = json.loads(filled(f"cell_{driver}.json", **values))
+        broadcasters = cell.pop("broadcasters")
+        text = _controllers(export, driver, joints, broadcasters)
+        files[f"config/controllers{number}.yaml"] = text
+        config = {name: config.get(name, []) + entries for name, entries in cell.items()}
     if export.job.follower is None:
         config["wrench"] = [None, None]
         config["grip"] = [_grip(export, arm) for arm in (0, 1)]
+    presses = any(config["wrench"])
     usual = {
-        "plan": plan_of(
-            export.workcell, "torque", "run_job.py", (0.0, 0.0), None, any(config["wrench"])
-        ),
+        "plan": plan_of(export.workcell, "torque", "run_job.py", (0.0, 0.0), None, presses),
         "simulated": driver == "simulation",
         "lag": export.lag,
         "step": export.step,
@@ -227,13 +205,9 @@ def torque_files(export: Export) -> dict[str, str | bytes]:
 def _grip(export: Export, arm: int) -> dict[str, Any]:
     """Describe how the hands of an arm are switched and watched in ROS.
 
-    Args:
-        export: the job.
-        arm: index of the arm.
-
     Returns:
-        A dictionary. `name` and `kind` are name and type of the service that switches the hands.
-        `on` and `off` are the fields of the two requests. `input` has the `topic`, its message type
+        A dictionary. `name` and `kind` are name and type of the service that switches the hands,
+        `on` and `off` the fields of the two requests. `input` has the `topic`, its message type
         `kind` and the `pin` with which the hands report that they hold; it is None if they report
         nothing.
     """
@@ -267,13 +241,9 @@ def _controllers(
     Args:
         export: the job.
         driver: name of the driver.
-        joints: names in ROS of the manager's joints, each with its index among the joints of both
-            arms.
+        joints: index of each joint of the manager among the joints of both arms, by name in ROS.
         broadcasters: parameters of each further controller, by its name. Their key `type` goes to
             the manager.
-
-    Returns:
-        The content of the parameter file.
     """
     cell = export.workcell
     rates = [robot.driver.rate for robot in cell.robots if robot.driver.rate is not None]
@@ -305,12 +275,8 @@ def _controllers(
 
 
 def joint_inertia(job: Job) -> Array:
-    """Compute the mean inertia about each joint during a job, without the payload: the diagonal of
-    the joint-space inertia matrices of arms and tools.
-
-    Returns:
-        (joints,) inertia of all joints, both arms side by side [kg m^2, for sliding joints kg].
-    """
+    """Compute the mean inertia about each joint (joints,) during a job, without the payload, both
+    arms side by side [kg m^2, for sliding joints kg]: the diagonal of the inertia matrices."""
     found, begin = [], 0
     for robot, joints in zip(job.workcell.robots, job.joint_names, strict=True):
         model = build_robot_model(robot).model
@@ -322,16 +288,7 @@ def joint_inertia(job: Job) -> Array:
 
 
 def _values(export: Export, arm: int) -> dict[str, Any]:
-    """Return values for those placeholders of an arm's template that the templates of all makers
-    share.
-
-    Args:
-        export: the job.
-        arm: index of the arm.
-
-    Returns:
-        Values by name of the placeholder.
-    """
+    """Return the values of the placeholders that the templates of all makers have, by name."""
     robot, prefix = export.workcell.robots[arm], prefixes(export.workcell)[arm]
     mass, centre = export.tool_load(arm)
     spaces = [prefix.rstrip("_") for prefix in prefixes(export.workcell)]
@@ -350,16 +307,8 @@ def _values(export: Export, arm: int) -> dict[str, Any]:
     }
 
 
-def _franka(export: Export, arm: int) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Return what a Franka arm adds to the files of its bundle.
-
-    Args:
-        export: the job.
-        arm: index of the arm.
-
-    Returns:
-        - Values that replace the placeholders of the arm's template, by name of the placeholder.
-        - Parameters of the arm's broadcasters, by name of the controller.
+def _franka(export: Export, arm: int) -> dict[str, Any]:
+    """Return the values of the placeholders in a Franka arm's template, by name.
 
     Raises:
         SettingsError: a torque changes faster than libfranka accepts.
@@ -374,21 +323,23 @@ def _franka(export: Export, arm: int) -> tuple[dict[str, Any], dict[str, dict[st
     load = export.workcell.robots[arm].tool_load
     inertia = np.zeros((3, 3)) if load is None else load.inertia
     torque, (force, moment) = _contact(export.job, arm)
-    forces = [CONTACT * force + SPARE_FORCE] * 3 + [CONTACT * moment + SPARE_TORQUE] * 3
+    most = {
+        "torque": (CONTACT * torque + SPARE_TORQUE).tolist(),
+        "force": [CONTACT * force + SPARE_FORCE] * 3 + [CONTACT * moment + SPARE_TORQUE] * 3,
+    }
+    thresholds = {
+        f"{end}_{what}_thresholds_{when}": most[what]
+        for when in ("acceleration", "nominal")
+        for what in ("torque", "force")
+        for end in ("lower", "upper")
+    }
     values = _values(export, arm)
-    values |= {
+    return values | {
         "kind": _franka_type(export.job.joint_names[arm]),
         "prefix": values["prefix"].removesuffix("_"),
         "inertia": inertia.T.ravel().tolist(),
-        "torques": (CONTACT * torque + SPARE_TORQUE).tolist(),
-        "forces": forces,
+        "thresholds": json.dumps(thresholds),
     }
-    state = {
-        "type": "franka_robot_state_broadcaster/FrankaRobotStateBroadcaster",
-        "robot_type": values["kind"],
-        "arm_prefix": values["prefix"],
-    }
-    return values, {"franka_robot_state_broadcaster": state}
 
 
 def _franka_type(joints: Sequence[str]) -> str:
@@ -398,16 +349,8 @@ def _franka_type(joints: Sequence[str]) -> str:
 
 
 def _contact(job: Job, arm: int) -> tuple[Array, tuple[float, float]]:
-    """Compute the largest loads of an arm by its contact with the box during a job.
-
-    Args:
-        job: the job.
-        arm: index of the arm.
-
-    Returns:
-        Largest torque (n_joints,) of each joint [N m, for sliding joints N]; and largest force [N]
-        and moment [N m] at the pad.
-    """
+    """Compute the largest torque (n_joints,) of an arm's joints by its contact with the box [N m,
+    for sliding joints N], and the largest force [N] and moment [N m] at its pad."""
     first = len(job.joint_names[0])
     span = slice(0, first) if arm == 0 else slice(first, None)
     torque = [np.abs(p.motion.contact_effort(p.force.wrench)[:, span]).max(0) for p in job.phases]
@@ -416,26 +359,7 @@ def _contact(job: Job, arm: int) -> tuple[Array, tuple[float, float]]:
     return np.max(torque, axis=0), (size[0], size[1])
 
 
-def _ur(export: Export, arm: int) -> tuple[dict[str, Any], dict[str, dict[str, Any]]]:
-    """Return what a Universal Robots arm adds to the files of its bundle.
-
-    Args:
-        export: the job.
-        arm: index of the arm.
-
-    Returns:
-        - Values that replace the placeholders of the arm's template, by name of the placeholder.
-        - Parameters of the arm's broadcasters, by name of the controller.
-    """
+def _ur(export: Export, arm: int) -> dict[str, Any]:
+    """Return the values of the placeholders in a UR arm's template, by name."""
     found = re.search(UR_TYPE, described(export.workcell.robots[arm]))
-    values = _values(export, arm)
-    prefix = values["prefix"]
-    wrench = {
-        "type": "force_torque_sensor_broadcaster/ForceTorqueSensorBroadcaster",
-        "sensor_name": f"{prefix}tcp_fts_sensor",
-        "state_interface_names": [f"{k}.{a}" for k in ("force", "torque") for a in "xyz"],
-        "frame_id": f"{prefix}tool0_controller",
-    }
-    status = {"type": "ur_controllers/GPIOController", "tf_prefix": prefix}
-    broadcasters = {"force_torque_sensor_broadcaster": wrench, "io_and_status_controller": status}
-    return values | {"kind": found.group() if found else "ur10e"}, broadcasters
+    return _values(export, arm) | {"kind": found.group() if found else "ur10e"}

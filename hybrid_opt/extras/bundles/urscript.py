@@ -47,10 +47,7 @@ gives this limit to force_mode."""
 
 
 def require_followed(job: Job) -> None:
-    """Check that URScript's force mode can follow the motion of the pad along its normal.
-
-    Args:
-        job: the job.
+    """Check that URScript's force mode can follow the motion of the pressing pad along its normal.
 
     Raises:
         SettingsError: the carry is too fast; the message states the speed and remedies.
@@ -73,12 +70,7 @@ def require_followed(job: Job) -> None:
 
 
 def normal_speed(job: Job, arm: int) -> float:
-    """Return the largest speed of an arm's pad along its normal while the box is held [m/s].
-
-    Args:
-        job: the job.
-        arm: index of the arm.
-    """
+    """Return the largest speed of an arm's pad along its normal while the box is held [m/s]."""
     contact, orientation = job.workcell.contacts[arm], job.workcell.task.orientation
     fastest = 0.0
     for phase in job.held:
@@ -94,9 +86,6 @@ def normal_speed(job: Job, arm: int) -> float:
 
 def urscript_files(export: Export) -> dict[str, str | bytes]:
     """Return the URScript programs of both arms, as texts by path.
-
-    Args:
-        export: the job at the target's time steps.
 
     Raises:
         SettingsError: the time step is not a multiple of the controller's cycle that fills every
@@ -119,7 +108,7 @@ def urscript_files(export: Export) -> dict[str, str | bytes]:
 
 
 def _program(export: Export, arm: int) -> str:
-    job, robot = export.job, export.workcell.robots[arm]
+    job, robot, (mass, centre) = export.job, export.workcell.robots[arm], export.tool_load(arm)
     step, phases = float(np.diff(export.sampled.time).mean()), enumerate(job.phases)
     reach = enumerate(export.document["robots"][arm]["reach"])
     names = [phase.name for phase in job.phases]
@@ -140,7 +129,7 @@ def _program(export: Export, arm: int) -> str:
         title=f"{comment(job.workcell.name)}: robot {comment(robot.name)}",
         first=_list(export.sampled.arm(arm, export.sampled.q)[0]),
         tcp=_pose(robot.T_flange_pad),
-        payload=_payload(export, arm),
+        payload=f"{mass:.4f}, {_list(centre)}",
         away="\n".join(
             f"    away = away + {way:.4f} * norm(here[{joint}] - target[{joint}])"
             for joint, way in reach
@@ -162,39 +151,25 @@ def _phase(export: Export, arm: int, index: int, name: str) -> Iterator[str]:
     sampled = export.sampled
     q, span = sampled.arm(arm, sampled.q), sampled.span(index)
     force = sampled.normal_force[:, arm]
-    most = float(force[span].max())
+    most, presses = float(force[span].max()), export.job.follower is not None
     every = math.ceil(FORCE_EVERY / float(np.diff(sampled.time).mean()) - 1e-9)
     yield f"  def {name}():"
     if name in SWITCHES:
         yield f"    grip({SWITCHES[name]})"
-    if export.job.follower is None:
-        for k in range(span.start + 1, span.stop):
-            yield f"    go({_list(q[k])}, 0.0)"
-        if name in SWITCHES:
-            yield f"    wait_for_hands({SWITCHES[name]})"
-        yield "  end"
-        return
     for k in range(span.start + 1, span.stop):
-        # Until the next reference no less than is needed.
-        ahead = k + every + 3
-        newton = float(force[k:ahead].max()) if name in HELD_PHASES else float(force[k])
+        newton = float(force[k]) if presses else 0.0
+        if presses and name in HELD_PHASES:
+            # Until the next reference no less than is needed.
+            newton = float(force[k : k + every + 3].max())
         yield f"    go({_list(q[k])}, {newton:.3f})"
         # Before the box is lifted the pads have to press.
-        if name in HELD_PHASES or (name == "press" and newton >= PRESSED * most > 0.0):
+        if presses and (
+            name in HELD_PHASES or (name == "press" and newton >= PRESSED * most > 0.0)
+        ):
             yield f"    feel({newton:.3f})"
+    if name in SWITCHES:
+        yield f"    wait_for_hands({SWITCHES[name]})"
     yield "  end"
-
-
-def _payload(export: Export, arm: int) -> str:
-    """Return the arguments of URScript's set_target_payload: the mass of an arm's tool [kg], and
-    its centre of mass in the flange frame [m].
-
-    Args:
-        export: the job.
-        arm: index of the arm.
-    """
-    mass, centre = export.tool_load(arm)
-    return f"{mass:.4f}, {_list(centre)}"
 
 
 def _pose(T: Array) -> str:

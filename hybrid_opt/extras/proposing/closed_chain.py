@@ -76,7 +76,7 @@ class _Follower:
         start, goal = waypoints[0].lower, waypoints[-1].lower
         self.name, self.many = robot.name, many
         self.names = list(model.names)[1:]
-        self.redundant = many.workcell.task.redundant_places[many.arm]
+        self.redundant = many.workcell.task.redundant_entries[many.arm]
         self.T_box_joint = many.held(hold.spin)
         key = f"robots[{many.arm}].min_manipulability = {robot.min_manipulability:g} m^3"
         self.singular = f"{robot.name} is near a singular posture ({key})"
@@ -108,7 +108,7 @@ class _Follower:
             q,
             T_world_box @ self.T_box_joint,
             joints,
-            extended[:, [place for _, place in self.redundant]],
+            extended[:, [entry for _, entry in self.redundant]],
             CHAIN_NEWTON_STEPS,
             CHAIN_RESIDUAL,
             JUMP,
@@ -205,8 +205,8 @@ class ClosedChain:
         closed, found = np.ones(len(extended), dtype=bool), []
         for arm, near in zip(self._arms, q, strict=True):
             guess = near.copy()
-            for joint, place in arm.redundant:
-                guess[:, joint] = extended[:, place]
+            for joint, entry in arm.redundant:
+                guess[:, joint] = extended[:, entry]
             there = arm.many.solve(guess, T_world_box @ arm.T_box_joint, steps)
             closed &= there.residual <= REACHED
             closed &= arm.side * there.determinant >= arm.many.least

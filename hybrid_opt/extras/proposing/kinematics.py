@@ -93,7 +93,7 @@ class ArmKinematics:
     def __init__(self, workcell: Workcell, arm: int, geometry: ArmGeometry | None = None) -> None:
         self.workcell, self.arm = workcell, arm
         self.geometry = geometry = geometry or arm_geometry(workcell, arm)
-        self.redundant = tuple(joint for joint, _ in workcell.task.redundant_places[arm])
+        self.redundant = tuple(joint for joint, _ in workcell.task.redundant_entries[arm])
         self.common = [joint.drives[arm] for joint in workcell.task.redundant if joint.is_common]
         self.following = [k for k in range(geometry.joints) if k not in self.redundant]
         self.lower, self.upper = np.asarray(geometry.lower), np.asarray(geometry.upper)

@@ -123,8 +123,8 @@ def _place(task: Task, pose: Array, holds: tuple[Hold, Hold], end: int) -> Chain
     extended = np.zeros(task.extended_size)
     extended[:POSE_SIZE] = pose
     for arm, q in enumerate(joints):
-        for joint, place in task.redundant_places[arm]:
-            extended[place] = q[joint]
+        for joint, entry in task.redundant_entries[arm]:
+            extended[entry] = q[joint]
     return ChainConfiguration(extended, (joints[0], joints[1]))
 
 

@@ -136,8 +136,9 @@ class PressedBox(HeldBox):
         self._data.efc_aref[rows] -= sign * np.einsum("nij,nj->ni", axes, unseen)
 
     def _unseen(self, pad: int) -> Array:
-        """Compute the acceleration dJ/dt v (3,) of a pad relative to the box that MuJoCo neglects,
-        world axes [m/s^2].
+        """Compute the acceleration dJ/dt v (3,) of a pad relative to the box, which MuJoCo
+        neglects, along world axes [m/s^2]. J is the Jacobian of the contact, v the joint
+        velocities.
 
         Args:
             pad: index of the pad's robot.

@@ -339,9 +339,9 @@ class HeldInHands:
 class _Displaced:
     """The second arm's hands in one simulation, displaced little by little.
 
-    Friction does not feel a body that is placed elsewhere. So a displacement along a patch and a
-    rotation about its normal move the rest positions of the layer's springs; only the displacement
-    along the normal and the tilt place the hand elsewhere.
+    In MuJoCo a body that is set to another pose causes no friction. So a displacement along a patch
+    and a rotation about its normal move the rest positions of the layer's springs; only the
+    displacement along the normal and the tilt change the pose of the hand itself.
     """
 
     def __init__(self, model: Any, held: HeldInHands, simulation: HandSimulation) -> None:

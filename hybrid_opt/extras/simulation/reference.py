@@ -22,9 +22,8 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.errors import SimulationError
 from hybrid_opt.extras.simulation.box import refuse_motion_at_ends
 from hybrid_opt.extras.simulation.scene import ArmSettings
-from hybrid_opt.job.smooth import driven_timing, without_jumps
 from hybrid_opt.robust.squeeze import Squeeze, SqueezeSettings, commanded_forces
-from hybrid_opt.timing.jerk import applicable_jerk_limits
+from hybrid_opt.timing.jerk import applicable_jerk_limits, driven_timing, without_jumps
 from hybrid_opt.timing.records import Timing
 from symbolic.array import Array
 from symbolic.errors import SettingsError

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import ctypes
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
 from typing import Any
 
 import casadi as ca
@@ -167,3 +170,12 @@ def ipopt(program: NonlinearProgram, iterations: int, barrier: float) -> Answer:
         usable=bool(np.isfinite(z).all()),
         iterations=int(statistics["iter_count"]),
     )
+
+
+def use_one_thread() -> None:
+    """Limit IPOPT's linear algebra to one thread, so that it does not wait on cores that other
+    workers use; its matrices are too small for threads. Its library is loaded with the first solve,
+    too late for `codegen.native.one_thread`."""
+    for library in Path(ca.__file__).parent.glob("*openblas*.so*"):
+        with suppress(OSError, AttributeError):
+            ctypes.CDLL(str(library)).openblas_set_num_threads(1)

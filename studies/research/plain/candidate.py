@@ -51,7 +51,7 @@ class PlainEvaluator:
             PlainArm(
                 workcell.robots[i],
                 workcell.contacts[i],
-                tuple(joint for joint, _ in workcell.task.redundant_places[i]),
+                tuple(joint for joint, _ in workcell.task.redundant_entries[i]),
                 workcell.task.orientation,
             )
             for i in (0, 1)
@@ -68,7 +68,7 @@ class PlainEvaluator:
         outputs = {"time": time, "pose": pose, "rate": rate, "second_rate": second}
         outputs |= {name: value for name, value in load.items() if not name.startswith("wrench")}
         for i, arm in enumerate(self.arms):
-            columns = [place - 6 for _, place in self.workcell.task.redundant_places[i]]
+            columns = [entry - 6 for _, entry in self.workcell.task.redundant_entries[i]]
             followed = arm.follow(self.start[i], pose, load[f"wrench_{i + 1}"], values[:, columns])
             outputs |= {f"{name}_{i + 1}": value for name, value in followed.items()}
         constraint = np.array([self._constraints(outputs, k) for k in range(len(time))])

@@ -26,7 +26,7 @@ from hybrid_opt.campaign.settings import polished_file
 from hybrid_opt.errors import DamagedResultsWarning, ResultsError
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.indicators import metrics
-from hybrid_opt.polishing.records import PolishedFront, PolishOutcome
+from hybrid_opt.polishing.front import PolishedFront, PolishOutcome
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings, ProbeSettings
 from hybrid_opt.polishing.solvers.base import Residuals
 from hybrid_opt.progress import Progress

@@ -13,8 +13,8 @@ from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.polishing.cell import SmoothCell
 from hybrid_opt.polishing.drive import DriveStepMethod
 from hybrid_opt.polishing.drive_front import recheck_timing
+from hybrid_opt.polishing.front import Solution
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
-from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from hybrid_opt.timing.model import TimingModel

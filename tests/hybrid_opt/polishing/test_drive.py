@@ -12,7 +12,7 @@ from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.polishing.drive import DriveStepMethod
-from hybrid_opt.polishing.point import Solution
+from hybrid_opt.polishing.front import Solution
 from hybrid_opt.polishing.polisher import Polisher
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.timing.model import REFINEMENT, TimingModel

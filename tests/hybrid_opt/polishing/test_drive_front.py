@@ -11,8 +11,8 @@ import hybrid_opt as ho
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, duration_unit
 from hybrid_opt.indicators import metrics
+from hybrid_opt.polishing.front import PolishedFront
 from hybrid_opt.polishing.polisher import Polisher
-from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError

@@ -29,10 +29,10 @@ from hybrid_opt.polishing.front import (
     IMPROVEMENT_TOLERANCE,
     OPTIMAL_STATIONARITY,
     ParetoArchive,
+    PolishedFront,
+    Solution,
 )
-from hybrid_opt.polishing.point import Solution
 from hybrid_opt.polishing.polisher import Polisher
-from hybrid_opt.polishing.records import PolishedFront
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings, ProbeSettings
 from studies.research.best_front import read_reference_front
 from symbolic.array import Array

@@ -14,7 +14,6 @@ from hybrid_opt.carry import BoxMotion
 from hybrid_opt.errors import JobError
 from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
 from hybrid_opt.job.plan import JobModel
-from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.recommending.advice import changes_of_cell
 from hybrid_opt.recommending.choice import DrivenPaths
 from hybrid_opt.recommending.recommendation import (
@@ -28,6 +27,7 @@ from hybrid_opt.recommending.recommendation import (
 from hybrid_opt.robust.cases import random_cases
 from hybrid_opt.robust.force import RobustModel, robust_model, subsample
 from hybrid_opt.robust.squeeze import commanded_forces
+from hybrid_opt.timing.jerk import driven_timing
 from hybrid_opt.timing.solve import time_path
 from symbolic.array import Array
 from symbolic.errors import SettingsError

@@ -9,8 +9,8 @@ from __future__ import annotations
 import casadi as ca
 import numpy as np
 
-from hybrid_opt.timing.limits import squared_speed_limit
 from hybrid_opt.timing.model import REFINEMENT, TimingModel
+from hybrid_opt.timing.programs import squared_speed_limit
 from hybrid_opt.timing.records import TimingLimits
 from symbolic.array import Array
 from symbolic.contact.load import LOAD_OUTPUTS, load_function

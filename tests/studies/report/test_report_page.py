@@ -26,7 +26,7 @@ from hybrid_opt.display.table import NOTHING
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, PAPER_OBJECTIVES
 from hybrid_opt.indicators.metrics import BindingBound
 from hybrid_opt.job.plan import JobModel
-from hybrid_opt.job.smooth import driven_timing
+from hybrid_opt.timing.jerk import driven_timing
 from studies.report import PAGE, generate, page_carries, page_data
 from studies.report.data import ReportData
 from studies.report.generate import report_tables, write_report

@@ -14,12 +14,12 @@ from hybrid_opt.campaign.settings import UNION
 from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.objectives import ROBUST_DRIVABLE_OBJECTIVES
-from hybrid_opt.job.smooth import driven_timing
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from hybrid_opt.progress import Progress
 from hybrid_opt.recommending.recommendation import level_force
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.store.trajectory_file import read_trajectory, replay
+from hybrid_opt.timing.jerk import driven_timing
 from studies.programs.study import StudySettings, run_study
 from studies.report.data import ReportData, gather
 from studies.report.generate import report_tables

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import json
 import tomllib
-from argparse import ArgumentParser
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
@@ -33,8 +32,7 @@ LAG, STIFFNESS, SPEED = 0.01, 0.25, 0.95
 the planned one."""
 
 EVERY, WINDOW = 0.02, 5
-"""Time between two measurements of moving arms [s], and number of measurements from which a speed
-is computed."""
+"""Time between two measurements of moving arms [s], and how many give a speed."""
 
 AHEAD, BEHIND = 0.05, 0.3
 """A measured posture is searched for on the path within these times around its command [s]."""
@@ -168,12 +166,10 @@ class Looks:
     def note(
         self, now: float, machine: Machine, seen: Seen, raw: list[float | None], way: float = nan
     ) -> None:
-        """Store a measurement, if the job runs at a constant rate.
+        """Store a measurement of the time `now` [s], if the job runs at a constant rate.
 
         Args:
-            now: time of the measurement [s].
             machine: state machine of the job, with the commanded point on the path.
-            seen: measured state of the arms.
             raw: reading of each arm's force sensor [N]; None without a sensor.
             way: distance of the pressing pad beyond its planned position [m]; NaN if unknown.
         """
@@ -198,12 +194,7 @@ class Looks:
 
     def speed(self, job: Job, arm: int) -> float:
         """Return the largest measured speed of an arm's pad, divided by the largest planned speed
-        of this pad.
-
-        Args:
-            job: the job that was run.
-            arm: index of the arm.
-        """
+        of this pad."""
         reach, found = job.robots[arm]["reach"], [0.0]
         for one, other in zip(self.moving, self.moving[WINDOW:], strict=False):
             passed = other.time - other.age[arm] - one.time + one.age[arm]
@@ -216,12 +207,7 @@ class Looks:
 
     def late(self, job: Job, arm: int) -> float:
         """Return the median delay of an arm's measured posture behind the commanded point on the
-        path [s]; NaN without measurements.
-
-        Args:
-            job: the job that was run.
-            arm: index of the arm.
-        """
+        path [s]; NaN without measurements."""
         fastest, found = max(job.speed(arm, s) for s in job.time), []
         for look in self.moving:
             forward = look.direction
@@ -233,16 +219,12 @@ class Looks:
         return median(found) if found else nan
 
     def contact(self, arm: int, lag: float) -> dict[str, float]:
-        """Evaluate the readings of an arm's force sensor while a block was pressed.
-
-        Args:
-            arm: index of the arm.
-            lag: delay of the arm behind its commands [s].
+        """Evaluate the readings of an arm's force sensor while a block was pressed. `lag` is the
+        arm's delay behind its commands [s].
 
         Returns:
-            A dictionary with `sign`, 1 or -1, the sign of the readings under pressure. If the
-            displacement of the pad is known, also with `stiffness`, of each arm at its pad [N/m];
-            otherwise with `press`, the measured force over the commanded one.
+            Values of `Measured` by name: `sign`; and `stiffness` if the displacement of the pad is
+            known, else `press`.
 
         Raises:
             Refused: no force was measured.
@@ -268,13 +250,7 @@ class Looks:
         return {"sign": sign, "stiffness": 2.0 * slope}
 
     def measured(self, job: Job, arm: int, lead: float) -> Measured:
-        """Return the measured properties of an arm.
-
-        Args:
-            job: the job that was run.
-            arm: index of the arm.
-            lead: time by which the arm's commands are sent ahead [s].
-        """
+        """Return the measured properties of an arm whose commands are sent ahead by `lead` [s]."""
         late = self.late(job, arm)
         found = Measured(lead + late, late, self.speed(job, arm))
         if not self.forces[arm] or not self.pressed:
@@ -283,38 +259,18 @@ class Looks:
         return Measured(found.lag, late, found.speed, self.offset(arm), **contact)
 
 
-def add_options(parser: ArgumentParser) -> None:
-    """Add the options of a program that runs a job: check only, move without a box, or measure both
-    arms.
-
-    Args:
-        parser: parser of the program's arguments, which is extended.
-    """
-    group = parser.add_mutually_exclusive_group()
-    for name, text in (
-        ("--check", "look at both arms and move nothing"),
-        ("--in-air", "drive the whole job without a box and without force"),
-        ("--bring-up", "measure both arms and write " + FILE),
-    ):
-        group.add_argument(name, action="store_true", help=text)
-
-
 def bring_up(
     folder: Path, job: Job, plan: dict[str, Any], drive: Callable[[Job, str], bool], looks: Looks
 ) -> int:
-    """Measure both arms and write the results into a bundle's folder.
+    """Measure both arms and write the results into a bundle's folder. Return the exit code.
 
     Args:
         folder: folder of the bundle.
         job: the job.
         plan: planned values, as `plan` in the bundle's configuration.
-        drive: function that takes a job and a word. It waits until somebody types the word, runs
-            the job to its end and back, and stores measurements in `looks`. It returns True if the
-            run was completed.
+        drive: function that takes a job and a word, runs the job to its end and back when somebody
+            says the word, and stores measurements in `looks`. It returns True if this is done.
         looks: store of the measurements.
-
-    Returns:
-        Exit code of the bring-up program.
 
     Raises:
         Refused: a measurement fails.
@@ -342,16 +298,7 @@ def bring_up(
 
 
 def require(folder: Path, job: Job, plan: dict[str, Any]) -> list[Measured]:
-    """Read the measured properties of both arms from a bundle's folder and compare them with the
-    planned values.
-
-    Args:
-        folder: folder of the bundle.
-        job: the job.
-        plan: planned values, as `plan` in the bundle's configuration.
-
-    Returns:
-        The measured properties of the first and of the second arm.
+    """Read the measured properties of both arms from a bundle's folder.
 
     Raises:
         Refused: nothing was measured, or a value differs too much from the plan.

@@ -25,5 +25,14 @@ MODULE CarryEgm$number
     ENDIF
   ENDPROC
 
-$check
+  ! It does not move the arm there: nobody has checked such a move for collisions.
+  PROC CarryCheckStart()
+    VAR jointtarget here;
+    here := CJointT();
+    IF $away THEN
+      TPWrite "Carry: jog the robot to carryFirst, pads away from the box.";
+      ! After Stop, a press of Start would go on behind the check.
+      EXIT;
+    ENDIF
+  ENDPROC
 ENDMODULE

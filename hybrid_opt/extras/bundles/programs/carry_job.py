@@ -40,24 +40,8 @@ class Refused(Exception):
 
 @dataclass(frozen=True)
 class Limits:
-    """Deviations from the plan at which a program stops the job, as in the job's file.
-
-    Attributes:
-        stop_time: duration of a stop along the path from the planned speed [s].
-        quick_stop: duration of a stop from the planned speed if an arm does not follow its commands
-            [s].
-        start: largest distance of a pad from its first position [m].
-        path: largest distance of a pad from its planned path [m].
-        behind: largest delay of an arm behind its reference [s].
-        skew: largest difference between the planned times of the places on the path that both arms
-            have reached [s].
-        force: largest deviation of a measured force from its reference while the box is held, over
-            the reference.
-        silence: longest time since an arm's last measurement [s].
-        grip: longest wait for inputs to report that hands hold or are open [s].
-        partner_stop_time: planned time that passes after one arm has stopped by itself, until both
-            arms are at rest [s].
-    """
+    """Deviations from the plan at which a program stops the job, as in the job's file;
+    `job.schema.json` says what each one limits, in which unit."""
 
     stop_time: float
     quick_stop: float
@@ -73,11 +57,8 @@ class Limits:
 
 @dataclass(frozen=True)
 class Switch:
-    """A phase of a job in which hands (cups, magnets, grippers) are switched on or off.
-
-    Attributes:
-        begin, end: planned time at which the phase begins, and ends [s].
-        on: True if the hands are switched on when the job runs forward.
+    """A phase of a job in which hands (cups, magnets, grippers) are switched, with the planned
+    times of its begin and end [s]; `on` is True if they are switched on when the job runs forward.
     """
 
     begin: float
@@ -97,9 +78,6 @@ class Job:
 
     def __init__(self, document: dict[str, Any]) -> None:
         """Store a document and check its format.
-
-        Args:
-            document: content of job.json.
 
         Raises:
             Refused: the document is not a job, or has another version.
@@ -123,9 +101,6 @@ class Job:
     @classmethod
     def read(cls, path: Path) -> Job:
         """Read the job from a file.
-
-        Args:
-            path: path of job.json.
 
         Raises:
             Refused: the file cannot be read.
@@ -151,28 +126,13 @@ class Job:
 
     def begin(self, name: str) -> float:
         """Return the planned time at which a phase begins [s]; the end of the job if it has no such
-        phase.
-
-        Args:
-            name: name of the phase.
-        """
-        first = 0.0
-        for last, phase in self._phases:
-            if phase == name:
-                return first
-            first = last
-        return self.end
+        phase."""
+        firsts = zip([0.0, *(last for last, _ in self._phases)], self._phases, strict=False)
+        return next((first for first, (_, phase) in firsts if phase == name), self.end)
 
     def is_touching(self, s: float) -> bool:
         """Return True if the box may already stand on its support although the set-down is not
-        finished.
-
-        This is so if s is in the set-down, if the planned position of the box is at most `TOUCH`
-        from its position at the end of the set-down, and if `stand` has not been called.
-
-        Args:
-            s: planned time [s].
-        """
+        finished: its planned position is at most `TOUCH` from the end of the set-down."""
         if self.phase(s) != "set_down" or self.is_standing:
             return False
         places, (k, x, _) = self.document["box"]["pose"], self._place(s)
@@ -234,24 +194,15 @@ class Job:
         return self.grips(s, 1.0) and self.grips(s, -1.0)
 
     def _place(self, s: float) -> tuple[int, float, float]:
-        """Find the interval between two samples that contains a planned time s [s].
-
-        Returns:
-            Index of the sample before s, passed share of the interval in [0, 1], and length of the
-            interval [s].
-        """
+        """Return the index of the sample before a planned time s [s], the passed share of the
+        interval to the next sample, in [0, 1], and the length of this interval [s]."""
         k = min(max(bisect_right(self.time, s) - 1, 0), len(self.time) - 2)
         step = self.time[k + 1] - self.time[k]
         return k, min(max((s - self.time[k]) / step, 0.0), 1.0), step
 
     def position(self, arm: int, s: float) -> list[float]:
         """Interpolate the planned joint positions of an arm by cubic polynomials [rad, or m for
-        sliding joints].
-
-        Args:
-            arm: index of the arm.
-            s: planned time [s].
-        """
+        sliding joints]."""
         k, x, step = self._place(s)
         q, v = self.robots[arm]["position"], self.robots[arm]["velocity"]
         a, b = (1.0 + 2.0 * x) * (1.0 - x) ** 2, x * (1.0 - x) ** 2 * step
@@ -268,24 +219,15 @@ class Job:
         return found
 
     def linear(self, arm: int, name: str, s: float) -> list[float]:
-        """Interpolate values of an arm linearly between samples, in the unit of the document.
-
-        Args:
-            arm: index of the arm.
-            name: key of the values in the arm's part of the document.
-            s: planned time [s].
+        """Interpolate values of an arm linearly between samples. `name` is their key in the arm's
+        part of the document, which also decides their unit.
         """
         k, x, _ = self._place(s)
         rows = self.robots[arm][name]
         return [(1.0 - x) * a + x * b for a, b in zip(rows[k], rows[k + 1], strict=True)]
 
     def force(self, arm: int, s: float) -> float:
-        """Return the commanded normal force of an arm [N].
-
-        Args:
-            arm: index of the arm.
-            s: planned time [s].
-        """
+        """Return the commanded normal force of an arm [N]."""
         k, x, _ = self._place(s)
         rows = self.robots[arm]["normal_force"]
         return float((1.0 - x) * rows[k] + x * rows[k + 1])
@@ -295,10 +237,8 @@ class Job:
         job runs [N m, for sliding joints N].
 
         Args:
-            arm: index of the arm.
             gravity: 'with_gravity' or 'without_gravity': whether the torques include the arm's
                 weight.
-            s: planned time [s].
             rate: derivative of the planned time with respect to time; 1 at the planned speed, 0 at
                 rest.
         """
@@ -307,37 +247,22 @@ class Job:
         return [b + (a - b) * rate * rate for a, b in zip(moving, holding, strict=True)]
 
     def distance(self, arm: int, q: Sequence[float], s: float) -> float:
-        """Return an upper bound of the distance between an arm's pad and its planned position [m].
-
-        Args:
-            arm: index of the arm.
-            q: joint positions of the arm [rad or m].
-            s: planned time of that position [s].
+        """Return an upper bound of the distance [m] of an arm's pad at joint positions q from its
+        planned position at the planned time s.
         """
         reach = self.robots[arm]["reach"]
         planned = self.position(arm, s)
         return float(sum(r * abs(a - b) for r, a, b in zip(reach, q, planned, strict=True)))
 
     def speed(self, arm: int, s: float) -> float:
-        """Return an upper bound of the planned speed of an arm's pad [m/s].
-
-        Args:
-            arm: index of the arm.
-            s: planned time [s].
-        """
+        """Return an upper bound of the planned speed of an arm's pad [m/s]."""
         rates = self.linear(arm, "velocity", s)
         reach = self.robots[arm]["reach"]
         return float(sum(r * abs(v) for r, v in zip(reach, rates, strict=True)))
 
     def _project(self, arm: int, q: Sequence[float], s: float) -> float:
-        """Estimate the planned time at which an arm's path is nearest to a posture, by one
-        Gauss-Newton step [s].
-
-        Args:
-            arm: index of the arm.
-            q: joint positions of the arm [rad or m].
-            s: planned time from which the step is made [s].
-        """
+        """Estimate the planned time at which an arm's path is nearest to a posture [s], by one
+        Gauss-Newton step from s."""
         planned, rates = self.position(arm, s), self.linear(arm, "velocity", s)
         rows = zip(self.robots[arm]["reach"], q, planned, rates, strict=True)
         fit = [(r * r * (a - b) * v, r * r * v * v) for r, a, b, v in rows]
@@ -359,8 +284,6 @@ class Job:
         Of equally near times the one nearest to `s` is returned.
 
         Args:
-            arm: index of the arm.
-            q: measured joint positions [rad or m].
             s: planned time around which to search [s].
             window: range of the search, as the least and the largest value of result minus `s` [s].
             near: distance [m]. If the pad is at most this far from its planned position at `s`, the

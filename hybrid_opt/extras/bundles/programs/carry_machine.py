@@ -65,25 +65,15 @@ class Clock:
     """
 
     def __init__(self, end: float, stop_time: float, s: float = 0.0, rate: float = 0.0) -> None:
-        """Start the clock at a planned time.
-
-        Args:
-            end: planned time of the end of the path [s].
-            stop_time: duration in which the rate changes by 1 [s].
-            s: planned time at the start [s].
-            rate: initial derivative ds/dt; 1 is the planned speed.
+        """Start the clock at the planned time s of a path that ends at the planned time `end` [s].
+        `stop_time` is the duration in which the rate changes by 1 [s].
         """
         self.s, self.rate, self._stop_time = s, rate, stop_time
-        self._low, self._high = 0.0, end
-        self._takes = stop_time
+        self._low, self._high, self._takes = 0.0, end, stop_time
         self._from, self._to, self._since = rate, rate, 0.0
 
     def keep(self, low: float, high: float) -> None:
-        """Limit the planned time of the commanded point to a range.
-
-        Args:
-            low, high: ends of the range [s].
-        """
+        """Limit the planned time of the commanded point to a range [s]."""
         self._low, self._high = low, high
 
     @property
@@ -108,11 +98,7 @@ class Clock:
 
     def advance(self, dt: float) -> None:
         """Move the commanded point on for a time step. Dividing the step into several calls changes
-        nothing.
-
-        Args:
-            dt: time step [s].
-        """
+        nothing."""
         count = max(1, math.ceil(dt / FINE)) if self.turning else 1
         for _ in range(count):
             self._step(dt / count)
@@ -144,12 +130,7 @@ class Clock:
 
     def ahead(self, rate: float, step: float) -> Iterator[Moment]:
         """Yield the states from now on if the rate changes to a given one, until the commanded
-        point moves no more.
-
-        Args:
-            rate: rate after the change.
-            step: time between two states [s].
-        """
+        point moves no more."""
         clock = copy(self)
         clock.turn(rate)
         yield Moment(0.0, clock.s, clock.rate, clock.change)
@@ -209,7 +190,6 @@ class Machine:
         """Begin at the start of the job, at rest.
 
         Args:
-            job: the job.
             lag: delay of both arms behind their commands [s].
             lead: time between the decision to stop and the first changed command [s].
             sensors: for each arm, True if its force must be measured.
@@ -217,7 +197,7 @@ class Machine:
         """
         self.job, self.lag, self.lead, self._sensors = job, lag, lead, sensors
         self.state, self.reason = "ready", ""
-        self.clock, self.stop_time = Clock(job.end, job.limits.stop_time), job.limits.stop_time
+        self.clock, self.stop_time = self._clock(0.0), job.limits.stop_time
         self._strikes, self._silent = 0, list[str]()
         self._inputs, self._gates, self._waited = inputs, list[float](), 0.0
         self._direction, self.opened = 1.0, False
@@ -225,23 +205,16 @@ class Machine:
     def start(self, seen: Seen) -> None:
         """Begin the job.
 
-        Args:
-            seen: measured state of both arms.
-
         Raises:
-            Refused: a stop is requested, an arm is silent or not at its first position, a sensor
-                gives no reading, or a pad is pressed.
+            Refused: the arms are not ready, as `check` finds.
         """
         self.check(seen)
         self.state = "running"
-        self.clock = Clock(self.job.end, self.job.limits.stop_time, 0.0, 1.0)
+        self.clock = self._clock(0.0, 1.0)
         self._aim(1.0)
 
     def check(self, seen: Seen) -> None:
         """Check that both arms are ready for the job.
-
-        Args:
-            seen: measured state of both arms.
 
         Raises:
             Refused: a stop is requested, an arm is silent or not at its first position, a sensor
@@ -262,21 +235,16 @@ class Machine:
                     f"sensor and state its tool_load; allowed are {most:.1f} N"
                 )
 
-    def hold(self, reason: str) -> None:
-        """Hold the present commanded posture because the arms cannot continue.
+    def _clock(self, s: float, rate: float = 0.0) -> Clock:
+        return Clock(self.job.end, self.job.limits.stop_time, s, rate)
 
-        Args:
-            reason: why the arms cannot continue, for `status`.
-        """
-        self.clock = Clock(self.job.end, self.job.limits.stop_time, self.clock.s)
+    def hold(self, reason: str) -> None:
+        """Hold the present commanded posture, with the reason why the arms cannot continue."""
+        self.clock = self._clock(self.clock.s)
         self.state, self.reason = "held", reason
 
     def resume(self, direction: float, seen: Seen) -> None:
-        """Continue a job that is held.
-
-        Args:
-            direction: 1 to run to the end of the job, -1 to run back to its beginning.
-            seen: measured state of both arms.
+        """Continue a job that is held, in the direction 1 to its end or -1 back to its beginning.
 
         Raises:
             Refused: the job is not held, or an arm is silent or not where it is held.
@@ -300,10 +268,7 @@ class Machine:
 
     def _aim(self, direction: float) -> None:
         """List the points of the path ahead at which the clock has to wait until inputs report the
-        state of hands, and limit the clock to the first.
-
-        Args:
-            direction: 1 forward, -1 back.
+        state of hands, and limit the clock to the first. `direction` is 1 forward, -1 back.
         """
         self._direction, s, found = direction, self.clock.s, self.job.switches
         gates = [switch.end for switch in found if switch.end >= s]
@@ -325,13 +290,8 @@ class Machine:
         self.clock.keep(low, high)
 
     def _wait(self, dt: float, seen: Seen) -> None:
-        """Wait while the clock stands at a point of the path where hands are switched, and continue
-        when all inputs report the commanded state.
-
-        Args:
-            dt: time since the last call [s].
-            seen: measured state of both arms.
-        """
+        """Wait while the clock stands at a point where hands are switched, and continue when all
+        inputs report the commanded state."""
         if self.clock.turning or self._gates[:1] != [self.clock.s]:
             return
         self._waited += dt
@@ -346,12 +306,7 @@ class Machine:
 
     def tick(self, dt: float, seen: Seen) -> None:
         """Advance the job by one time step. Stop or hold it if the measured state of the arms
-        requires it.
-
-        Args:
-            dt: time since the last call [s].
-            seen: measured state of both arms.
-        """
+        requires it."""
         self.clock.advance(dt)
         self.opened = False
         limit = self.job.limits.silence
@@ -378,7 +333,7 @@ class Machine:
             self.state = "held"
         elif self.state == "landing" and not self.clock.turning:
             self.job.stand(self.clock.s, seen.q)
-            self.clock = Clock(self.job.end, self.job.limits.stop_time, self.job.begin("release"))
+            self.clock = self._clock(self.job.begin("release"))
             self.state = "held"
             try:
                 self.resume(1.0, seen)
@@ -386,13 +341,8 @@ class Machine:
                 self.hold(str(error))
 
     def _lands(self, force: str) -> bool:
-        """Begin to stop the arms if a wrong force may mean that the box stands on its support.
-
-        This can only happen in the last part of the set-down. No stop begins if the release would
-        begin before the arms are at rest.
-
-        Args:
-            force: text on the wrong force, for `status`.
+        """Begin to stop the arms if a wrong force may mean that the box stands on its support. No
+        stop begins if the release would begin before the arms are at rest.
 
         Returns:
             True if the box may stand, whether or not a stop begins.
@@ -408,12 +358,8 @@ class Machine:
         return True
 
     def stop(self, reason: str, quick: bool = False) -> None:
-        """Stop along the path and hold the posture there.
-
-        Args:
-            reason: reason of the stop.
-            quick: True if an arm does not follow its commands, for a shorter stop.
-        """
+        """Stop along the path and hold the posture there; a quick stop is for an arm that does not
+        follow its commands."""
         if self.state == "running":
             self.state, self.reason = "stopping", reason
             limits = self.job.limits
@@ -445,12 +391,7 @@ class Machine:
         return f"keep their hands switched {'on' if self.grip else 'off'}"
 
     def _grip(self, arm: int, seen: Seen) -> str:
-        """Return a text that says what the input of an arm's hands reports.
-
-        Args:
-            arm: index of the arm.
-            seen: measured state of both arms.
-        """
+        """Return a text that says what the input of an arm's hands reports."""
         if seen.grip[arm] is None:
             return f"nothing is heard of the input of {self._name(arm)}'s hands"
         return f"the hands of {self._name(arm)} {'hold' if seen.grip[arm] else 'do not hold'}"
@@ -463,7 +404,6 @@ class Machine:
         path.
 
         Args:
-            seen: measured state of both arms.
             most: largest distance of a pad from its path [m].
             slack: planned time by which an arm may be ahead or behind on its path [s].
 
@@ -484,11 +424,7 @@ class Machine:
 
     def _wrong(self, seen: Seen) -> str:
         """Return the reason for which the measured postures and inputs do not allow the job to
-        continue, '' if they do. `_wrong_force` checks the forces.
-
-        Args:
-            seen: measured state of both arms.
-        """
+        continue, '' if they do. `_wrong_force` checks the forces."""
         limits, s = self.job.limits, self.clock.s
         # Nothing is lifted or let go, and no job done, by an arm that stands elsewhere.
         releases = self.job.phase(s) == "release" and not self.job.is_standing
@@ -534,11 +470,7 @@ class Machine:
 
     def _wrong_force(self, seen: Seen) -> str:
         """Return the reason for which the measured forces do not allow the job to continue, '' if
-        they do.
-
-        Args:
-            seen: measured state of both arms.
-        """
+        they do."""
         s, lift = self.clock.s, self.job.pressed
         for arm, measured in enumerate(seen.force):
             wanted = self.job.force(arm, s)

@@ -15,11 +15,10 @@ measuredForce 9; EgmSensor header 1 (seqno 1, tm 2, mtype 3), planned 2 (joints 
 
 from __future__ import annotations
 
-import argparse
 import json
+import logging
 import math
 import select
-import signal
 import socket
 import struct
 import sys
@@ -29,22 +28,14 @@ from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hybrid_opt.extras.bundles.programs.bring_up import (
-    AIR,
-    BACK,
-    BLOCK,
-    Looks,
-    Measured,
-    add_options,
-    bring_up,
-    require,
-    unloaded,
-)
+from hybrid_opt.extras.bundles.programs.bring_up import Looks, Measured
 from hybrid_opt.extras.bundles.programs.carry_job import Job, Refused
 from hybrid_opt.extras.bundles.programs.carry_machine import Machine, Seen
+from hybrid_opt.extras.bundles.programs.carry_program import Carry, options_of, run
 
 BUNDLE = Path(__file__).resolve().parent
 
@@ -65,8 +56,6 @@ MOST_PRESSED = 1.2
 CREEP = 0.002
 """Speed of the pressing pad while its stiffness is measured [m/s]."""
 
-CTRL_C = "Ctrl-C"
-
 
 class Press:
     """Controller of the pressing pad's position along its normal that adjusts the normal force.
@@ -76,12 +65,7 @@ class Press:
     """
 
     def __init__(self, config: dict[str, Any]) -> None:
-        """Start with a pad at its planned position, without displacement.
-
-        Args:
-            config: settings of the bundle, of which `gain`, `most`, `speed` and `compliance` are
-                read.
-        """
+        """Start with a pad at its planned position, with the settings `press` of the bundle."""
         self.way = 0.0
         self._missing = 0.0
         self._gain, self._most = config["gain"], config["most"]
@@ -95,7 +79,6 @@ class Press:
         integral of the measured error. Its speed and depth are bounded.
 
         Args:
-            dt: time step [s].
             wanted: commanded normal force now [N].
             soon: commanded normal force one delay of the arm later [N].
             felt: measured normal force [N]; None before the first measurement.
@@ -113,59 +96,52 @@ class Press:
 
     def creep(self, dt: float, wanted: float, felt: float) -> None:
         """Move the pad for one time step at a constant low speed, in the direction that reduces the
-        error of the force, to measure an unknown stiffness.
-
-        Args:
-            dt: time step [s].
-            wanted: commanded normal force [N].
-            felt: measured normal force [N].
-        """
+        error of the force, to measure an unknown stiffness."""
         self._move(self._most if felt < wanted else 0.0, CREEP * dt)
 
     def _move(self, target: float, step: float) -> None:
         self.way += min(max(target - self.way, -step), step)
 
 
-class Stream:
+class Stream(Carry):
     """The control of both arms by EGM: it answers each message of a controller with a commanded
     position."""
 
-    def __init__(self, job: Job, config: dict[str, Any], known: Sequence[Measured] | Looks) -> None:
-        """Prepare to wait for both controllers.
-
-        Args:
-            job: the job.
-            config: settings of the bundle.
-            known: measured properties of both arms; or a store of measurements, if the arms are to
-                be measured.
-        """
-        self.job, self.config = job, config
-        self.looks = known if isinstance(known, Looks) else None
-        self._signs = None if isinstance(known, Looks) else [each.sign for each in known]
-        sensors = config["sensors"] if self._signs else (False, False)
-        self.machine = Machine(job, 0.0, sensors=sensors)
-        self.press = Press(config["press"])
-        self.fault, self.command = "", ""
+    def __init__(
+        self,
+        job: Job,
+        config: dict[str, Any],
+        known: Sequence[Measured] | Looks,
+        log: Any,
+        sockets: Sequence[socket.socket] = (),
+    ) -> None:
+        """Prepare to wait for both controllers at a UDP socket each."""
+        super().__init__(known, log)
+        self.config = config
         self._arm: int = config["press"]["arm"]
         self._q: list[list[float] | None] = [None, None]
-        self._first: list[list[float] | None] = [None, None]
         self._follows = [False, False]
         self._force: list[float | None] = [None, None]
         self._news = [-math.inf, -math.inf]
-        self._last: float | None = None
-        self._ways = deque[tuple[float, float]](maxlen=KEPT)
+        self._sockets, self._waiting = sockets, [*sockets, sys.stdin]
         # A name that is no address is looked up once, before the stream.
         self._hosts = [socket.gethostbyname(host) for host in config["addresses"]]
         self.dropped = 0
+        self.take(job)
 
-    def seen(self, now: float) -> Seen:
-        """Return the measured state of the arms.
+    def take(self, job: Job) -> None:
+        """Store a job to be run next."""
+        self.job = job
+        sensors = self.config["sensors"] if self.signs else (False, False)
+        self.machine = Machine(job, 0.0, sensors=sensors)
+        self.press = Press(self.config["press"])
+        self._first: list[list[float] | None] = [None, None]
+        self._now: float | None = None
+        self._ways = deque[tuple[float, float]](maxlen=KEPT)
 
-        Args:
-            now: time [s].
-        """
-        age = [now - then for then in self._news]
-        q = list(self._q)
+    def seen(self) -> Seen:
+        """Return the measured state of the arms at the time of the last tick."""
+        now, q = self._now or 0.0, list(self._q)
         pressing = q[self._arm]
         if pressing is not None:
             # Where it would be without what it had been moved into the box when it was measured.
@@ -173,21 +149,15 @@ class Stream:
             then = self._news[self._arm] - self.config["lags"][self._arm]
             way = next((way for time, way in reversed(self._ways) if time <= then), 0.0)
             q[self._arm] = [a - way * slope for a, slope in zip(pressing, inward, strict=True)]
-        lost = self.fault not in ("", CTRL_C)
         force: list[float | None] = [None, None]
-        if self._signs:
-            both = zip(self._signs, self._force, strict=True)
+        if self.signs:
+            both = zip(self.signs, self._force, strict=True)
             force = [None if raw is None else sign * raw for sign, raw in both]
-        return Seen(q=q, force=force, age=age, fault=self.fault, lost=lost)
+        age = [now - then for then in self._news]
+        return Seen(q=q, force=force, age=age, fault=self.fault, lost=self.lost)
 
     def hear(self, arm: int, message: FromRobot, now: float) -> None:
-        """Store the measured state in a message from an arm's controller.
-
-        Args:
-            arm: index of the arm.
-            message: the message.
-            now: time of its arrival [s].
-        """
+        """Store the measured state in a message that has arrived from an arm's controller."""
         degrees = self._in_chain(arm, message.joints, message.further)
         if degrees is None:
             return
@@ -199,7 +169,7 @@ class Stream:
             self._force[arm] = message.force[2] if len(message.force) >= 3 else None
         self._follows[arm] = message.running
         if self.machine.state == "running" and not message.running:
-            self.fault = self.fault or self._not_following(arm)
+            self.fail(self._not_following(arm), lost=True)
 
     def _not_following(self, arm: int) -> str:
         return f"the controller of {self.job.robots[arm]['name']} does not follow"
@@ -207,21 +177,25 @@ class Stream:
     @property
     def missing(self) -> str:
         """Reason why the job cannot begin yet, '' if it can."""
-        if None in self._q:
+        if None in self._first:
             return "a controller is silent"
         return "" if all(self._follows) else self._not_following(self._follows.index(False))
 
-    def read(self, arm: int, data: bytes, host: str) -> FromRobot | None:
-        """Decode a packet from an arm's controller. Return None, and count the packet, if it is
-        damaged or comes from another host.
+    def check(self) -> None:
+        """Wait for both controllers, and raise a `Refused` if one does not begin or an arm is not
+        ready for the job."""
+        begin = time.monotonic()
+        while self.missing and not self.fault:
+            self.cycle()
+            if time.monotonic() - begin > PATIENCE:
+                raise Refused(f"{self.missing}: is CarryEgm running in both tasks?")
+        super().check()
 
-        Args:
-            arm: index of the arm.
-            data: content of the packet.
-            host: address of the sender.
-        """
+    def read(self, arm: int, data: bytes, host: str) -> FromRobot | None:
+        """Decode a packet from an arm's controller, sent by a host. Return None, and count the
+        packet, if it is damaged or comes from another host."""
         if host == self._hosts[arm]:
-            with suppress(ValueError, struct.error):
+            with suppress(ValueError):
                 return read_robot(data)
         self.dropped += 1
         return None
@@ -229,59 +203,69 @@ class Stream:
     def status(self) -> str:
         """Return a text that says in which state the job is."""
         strange = f" {self.dropped} packets were dropped, from other hosts or damaged."
-        return self.machine.status() + (strange if self.dropped else "")
+        return super().status() + (strange if self.dropped else "")
+
+    def cycle(self) -> None:
+        """Answer what both controllers have sent, and take words from the terminal."""
+        ready, _, _ = select.select(self._waiting, [], [], 0.01)
+        now = time.monotonic()
+        heard: dict[int, tuple[FromRobot, Any]] = {}
+        for arm, source in enumerate(self._sockets):
+            # What came while this computer was busy is old: the newest message counts.
+            for data, address in received(source):
+                message = self.read(arm, data, address[0])
+                if message is not None:
+                    self.hear(arm, message, now)
+                    heard[arm] = message, address
+        self.tick(now)
+        for arm, (message, address) in heard.items():
+            self._sockets[arm].sendto(self.answer(arm, message.number, now), address)
+        if sys.stdin in ready:
+            line = sys.stdin.readline()
+            self.command = line.strip()
+            if not line:
+                self._waiting.remove(sys.stdin)
 
     def tick(self, now: float) -> None:
-        """Advance the job to the time `now` [s]."""
-        dt = 0.0 if self._last is None else min(now - self._last, LONGEST_TICK)
-        self._last = now
-        before = self.machine.state
+        """Advance a job that has begun to the time `now` [s]."""
+        dt = 0.0 if self._now is None else min(now - self._now, LONGEST_TICK)
+        self._now, before = now, self.machine.state
         if before == "ready":
             return
-        seen = self.seen(now)
+        seen = self.seen()
         self.machine.tick(dt, seen)
-        clock = self.machine.clock
+        self._press(dt, seen)
+        self._ways.append((now, self.press.way))
+        self.obey()
+        if before != self.machine.state:
+            self.log.info(self.status())
+
+    def _press(self, dt: float, seen: Seen) -> None:
+        """Move the pressing pad for one time step, by the measured force."""
+        clock, is_running = self.machine.clock, self.machine.state == "running"
         soon = clock.s + clock.rate * self.config["lags"][self._arm]
         wanted, later = (self.job.force(self._arm, s) for s in (clock.s, soon))
-        if self.looks is None:
-            own, other = seen.force[self._arm], seen.force[1 - self._arm]
-            # A job that stops may do so because a sensor is wrong: what was integrated stays.
-            felt = None
-            if self.machine.state == "running":
-                felt = own if own is not None else other
-            self.press.tick(dt, wanted, later, felt)
-            spare = self.job.limits.force * self.job.force(self._arm, self.job.pressed)
-            if felt is not None and clock.s < self.job.pressed and felt > later + spare:
-                # The band begins when the pads hold; arms stiffer than measured show before.
-                name = self.job.robots[self._arm]["name"]
-                self.fault = self.fault or f"{name} presses {felt:.1f} N instead of {wanted:.1f} N"
-        elif self.machine.state == "running":
+        if self.looks is not None:
             raw = self._force[self._arm]
-            if raw is not None:
-                self.press.creep(dt, wanted, abs(raw - self.looks.offset(self._arm)))
-            self.looks.note(now, self.machine, seen, list(self._force), self.press.way)
-        self._ways.append((now, self.press.way))
-        if self.machine.state == "held" and self.command in ("continue", "back"):
-            direction = 1.0 if self.command == "continue" else -1.0
-            self.command = self.fault = ""
-            try:
-                self.machine.resume(direction, self.seen(now))
-            except Refused as error:
-                self.machine.hold(str(error))
-                print(self.status(), file=sys.stderr)
-        if before != self.machine.state:
-            print(self.status(), file=sys.stderr)
+            if is_running:
+                if raw is not None:
+                    self.press.creep(dt, wanted, abs(raw - self.looks.offset(self._arm)))
+                assert self._now is not None, "a tick has a time"
+                self.looks.note(self._now, self.machine, seen, list(self._force), self.press.way)
+            return
+        own, other = seen.force[self._arm], seen.force[1 - self._arm]
+        # A job that stops may do so because a sensor is wrong: what was integrated stays.
+        felt = (other if own is None else own) if is_running else None
+        self.press.tick(dt, wanted, later, felt)
+        spare = self.job.limits.force * self.job.force(self._arm, self.job.pressed)
+        if felt is not None and clock.s < self.job.pressed and felt > later + spare:
+            # The band begins when the pads hold; arms stiffer than measured show before.
+            name = self.job.robots[self._arm]["name"]
+            self.fail(f"{name} presses {felt:.1f} N instead of {wanted:.1f} N", lost=True)
 
     def answer(self, arm: int, number: int, now: float) -> bytes:
-        """Encode the message that commands an arm's joint positions.
-
-        The positions are those that the path reaches one delay of the arm later.
-
-        Args:
-            arm: index of the arm.
-            number: number of the message.
-            now: time [s].
-        """
+        """Encode the message that commands an arm's joint positions: those that the path reaches
+        one delay of the arm later."""
         clock, first = self.machine.clock, self._first[arm]
         if self.machine.state == "ready" and first is not None:
             q = first
@@ -291,18 +275,12 @@ class Stream:
             if arm == self._arm:
                 inward = self._inward(clock.s)
                 q = [value + self.press.way * slope for value, slope in zip(q, inward, strict=True)]
-        joints, further = self._as_abb(arm, [math.degrees(value) for value in q])
-        return to_robot(number, now, joints, further)
+        return to_robot(number, now, *self._as_abb(arm, [math.degrees(value) for value in q]))
 
     def _inward(self, s: float) -> list[float]:
         """Compute how far each joint of the pressing arm turns per metre by which its pad moves
-        into the box, along the contact normal.
-
-        Args:
-            s: planned time [s] since the beginning of the job.
-
-        Returns:
-            One value for each joint [rad/m], interpolated linearly between the samples of the job.
+        into the box, along the contact normal [rad/m]; interpolated linearly between the samples of
+        the job.
         """
         rows, time = self.config["inward"], self.job.time
         k = min(max(bisect_left(time, s) - 1, 0), len(rows) - 2)
@@ -312,14 +290,9 @@ class Stream:
     def _in_chain(
         self, arm: int, joints: Sequence[float], further: Sequence[float]
     ) -> list[float] | None:
-        """Return an arm's joint positions in the order of its joints, base first [degrees]; None if
-        their number is wrong. ABB counts the third of seven joints as an external axis.
-
-        Args:
-            arm: index of the arm.
-            joints: positions of the robot's axes in a message [degrees].
-            further: positions of the external axes in the message [degrees].
-        """
+        """Return an arm's joint positions in the order of its joints, base first [degrees], from
+        those of the robot's axes and of the external axes; None if their number is wrong. ABB
+        counts the third of seven joints as an external axis."""
         count = len(self.job.robots[arm]["joints"])
         if len(joints) < 6 or (count == 7 and not further):
             return None
@@ -327,111 +300,13 @@ class Stream:
         return found if count == 6 else [*found[:2], further[0], *found[2:]]
 
     def _as_abb(self, arm: int, degrees: list[float]) -> tuple[list[float], list[float]]:
-        count = len(self.job.robots[arm]["joints"])
-        if count == 6:
+        if len(self.job.robots[arm]["joints"]) == 6:
             return degrees, []
         return degrees[:2] + degrees[3:], [degrees[2]]
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Stream the job to both arms. Return the exit code, 0 when the job is done.
-
-    Args:
-        arguments: arguments of the command line; None for those of this process.
-    """
-    parser = argparse.ArgumentParser(description=__doc__)
-    add_options(parser)
-    options = parser.parse_args(arguments)
-    try:
-        job = Job.read(BUNDLE / "job.json")
-        config = json.loads((BUNDLE / "config/egm.json").read_text("utf-8"))
-        sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in config["ports"]]
-        for each, port in zip(sockets, config["ports"], strict=True):
-            each.bind(("", port))
-
-        def drive(part: Job, word: str) -> bool:
-            stream = Stream(part, config, looks)
-            print(BLOCK if word else AIR, file=sys.stderr)
-            if streamed(stream, sockets, word=word):
-                return False
-            stream.machine.hold("it goes back")
-            stream.command = "back"
-            return streamed(stream, sockets) == BACK
-
-        looks = Looks()
-        if options.check or options.in_air:
-            return streamed(Stream(unloaded(job), config, looks), sockets, options.check)
-        if options.bring_up:
-            return bring_up(BUNDLE, job, config["plan"], drive, looks)
-        return streamed(Stream(job, config, require(BUNDLE, job, config["plan"])), sockets)
-    except (OSError, Refused) as error:
-        print(error, file=sys.stderr)
-        return 2
-
-
-def streamed(
-    stream: Stream, sockets: Sequence[socket.socket], check: bool = False, word: str = ""
-) -> int:
-    """Answer both controllers until the job is done. Return the exit code.
-
-    Args:
-        stream: the control of both arms.
-        sockets: UDP socket for each controller.
-        check: True to check both arms without moving them.
-        word: word that somebody has to type before the job begins.
-
-    Raises:
-        Refused: a controller does not begin, or an arm is not at its first position.
-    """
-
-    def interrupted(*_: object) -> None:
-        if stream.machine.state == "held":
-            stream.command = "leave"
-        stream.fault = stream.fault or CTRL_C
-
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, interrupted)
-    begin = time.monotonic()
-    waiting: list[Any] = [*sockets, sys.stdin]
-    while stream.machine.state != "done":
-        ready, _, _ = select.select(waiting, [], [], 0.01)
-        now = time.monotonic()
-        heard: dict[int, tuple[FromRobot, Any]] = {}
-        for arm, source in enumerate(sockets):
-            # What came while this computer was busy is old: the newest message counts.
-            for data, address in received(source):
-                message = stream.read(arm, data, address[0])
-                if message is not None:
-                    stream.hear(arm, message, now)
-                    heard[arm] = message, address
-        stream.tick(now)
-        for arm, (message, address) in heard.items():
-            sockets[arm].sendto(stream.answer(arm, message.number, now), address)
-        if sys.stdin in ready:
-            line = sys.stdin.readline()
-            stream.command = line.strip()
-            if not line:
-                waiting.remove(sys.stdin)
-        if stream.machine.state == "ready" and not stream.missing and stream.command == word:
-            stream.machine.start(stream.seen(now))
-            if check:
-                print("both arms are at their first places", file=sys.stderr)
-                return 0
-        if stream.machine.state == "ready" and not word and now - begin > PATIENCE:
-            raise Refused(f"{stream.missing}: is CarryEgm running in both tasks?")
-        if stream.machine.state == "held" and stream.command == "leave":
-            print(f"left while {stream.status()}", file=sys.stderr)
-            return 1
-    return 0 if stream.machine.clock.s > 0.0 else BACK
-
-
 def received(source: socket.socket) -> Iterator[tuple[bytes, Any]]:
-    """Yield each packet that waits in a socket: its content, and the sender's address as Python's
-    `socket` gives it.
-
-    Args:
-        source: the socket.
-    """
+    """Yield content and sender's address of each packet that waits in a socket."""
     with suppress(BlockingIOError):
         while True:
             yield source.recvfrom(4096, socket.MSG_DONTWAIT)
@@ -465,32 +340,18 @@ class FromRobot:
 def read_robot(data: bytes) -> FromRobot:
     """Decode a message from a controller.
 
-    Args:
-        data: content of the packet.
-
     Raises:
         ValueError: the bytes are not such a message.
     """
-    number, running = 0, False
-    joints: tuple[float, ...] = ()
-    further: tuple[float, ...] = ()
-    force: tuple[float, ...] = ()
-    for field, value in _fields(data):
-        if isinstance(value, int):
-            continue
-        inner = list(_fields(value))
-        if field == 1:
-            number = next((v for f, v in inner if f == 1 and isinstance(v, int)), 0)
-        elif field == 2:
-            parts = {f: v for f, v in inner if isinstance(v, bytes)}
-            joints = _doubles(parts.get(1, b""), (1,))
-            further = _doubles(parts.get(3, b""), (1,))
-        elif field == 5:
-            running = any(f == 1 and v == RUNNING for f, v in inner)
-        elif field == 9:
-            # Newer controllers tell first whether force control is active.
-            force = _doubles(value, (1, 2))
-    return FromRobot(number, joints, further, force, running)
+    numbers = _integers(_inside(data, 1), 1)
+    return FromRobot(
+        numbers[0] if numbers else 0,
+        _doubles(_inside(data, 2, 1, 1)),
+        _doubles(_inside(data, 2, 3, 1)),
+        # Newer controllers tell first whether force control is active.
+        _doubles(_inside(data, 9, 1) or _inside(data, 9, 2)),
+        RUNNING in _integers(_inside(data, 5), 1),
+    )
 
 
 def to_robot(number: int, time: float, joints: Sequence[float], further: Sequence[float]) -> bytes:
@@ -501,32 +362,34 @@ def to_robot(number: int, time: float, joints: Sequence[float], further: Sequenc
         time: time of the message [s].
         joints, further: positions of the robot's axes and of the external axes [degrees].
     """
-    header = _number(1, number) + _number(2, round(1e3 * time) % 2**32) + _number(3, CORRECTION)
-    planned = _bytes(1, _packed(joints))
-    if further:
-        planned += _bytes(3, _packed(further))
-    return _bytes(1, header) + _bytes(2, planned)
+    header = _field(1, number) + _field(2, round(1e3 * time) % 2**32) + _field(3, CORRECTION)
+    planned = _field(1, _repeated(joints)) + (_field(3, _repeated(further)) if further else b"")
+    return _field(1, header) + _field(2, planned)
 
 
-def _packed(values: Sequence[float]) -> bytes:
-    # Repeated doubles of version 2 are written one by one.
-    return b"".join(_raw(1 << 3 | 1) + struct.pack("<d", value) for value in values)
+def _inside(data: bytes, *path: int) -> bytes:
+    """Return the content of a field of a protobuf message that lies at a path of field numbers.
+    Several values of the field are joined, since protobuf merges messages in this way.
+    """
+    for number in path:
+        parts = (value for field, value in _fields(data) if field == number)
+        data = b"".join(value for value in parts if isinstance(value, bytes))
+    return data
 
 
-def _doubles(data: bytes, numbers: tuple[int, ...]) -> tuple[float, ...]:
-    found: list[float] = []
-    for field, value in _fields(data):
-        if field in numbers and isinstance(value, bytes) and len(value) % 8 == 0:
-            found += struct.unpack(f"<{len(value) // 8}d", value)
-    return tuple(found)
+def _integers(data: bytes, number: int) -> list[int]:
+    return [v for field, v in _fields(data) if field == number and isinstance(v, int)]
+
+
+def _doubles(data: bytes) -> tuple[float, ...]:
+    if len(data) % 8:
+        raise ValueError("this is no message of EGM")
+    return struct.unpack(f"<{len(data) // 8}d", data)
 
 
 def _fields(data: bytes) -> Iterator[tuple[int, int | bytes]]:
     """Yield number and value of each field of a protobuf message. Values of varints are integers,
     all others bytes.
-
-    Args:
-        data: the encoded message.
 
     Raises:
         ValueError: the bytes are not a message.
@@ -550,16 +413,25 @@ def _fields(data: bytes) -> Iterator[tuple[int, int | bytes]]:
 
 def _varint(data: bytes, place: int) -> tuple[int, int]:
     value = 0
-    for k in range(10):
-        if place + k >= len(data):
-            break
-        value |= (data[place + k] & 0x7F) << (7 * k)
-        if data[place + k] < 0x80:
+    for k, byte in enumerate(data[place : place + 10]):
+        value |= (byte & 0x7F) << (7 * k)
+        if byte < 0x80:
             return value, place + k + 1
     raise ValueError("this is no message of EGM")
 
 
-def _raw(value: int) -> bytes:
+def _field(number: int, value: int | bytes) -> bytes:
+    if isinstance(value, int):
+        return _as_varint(number << 3) + _as_varint(value)
+    return _as_varint(number << 3 | 2) + _as_varint(len(value)) + value
+
+
+def _repeated(values: Sequence[float]) -> bytes:
+    # Repeated doubles of version 2 are written one by one.
+    return b"".join(_as_varint(1 << 3 | 1) + struct.pack("<d", value) for value in values)
+
+
+def _as_varint(value: int) -> bytes:
     found = b""
     while value >= 0x80:
         found += bytes([value & 0x7F | 0x80])
@@ -567,12 +439,21 @@ def _raw(value: int) -> bytes:
     return found + bytes([value])
 
 
-def _number(field: int, value: int) -> bytes:
-    return _raw(field << 3) + _raw(value)
-
-
-def _bytes(field: int, value: bytes) -> bytes:
-    return _raw(field << 3 | 2) + _raw(len(value)) + value
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Stream the job by the arguments of the command line. Return the exit code, 0 when it is
+    done."""
+    options = options_of(__doc__, arguments)
+    logging.basicConfig(level=logging.INFO, format="%(message)s")
+    log = logging.getLogger()
+    try:
+        config = json.loads((BUNDLE / "config/egm.json").read_text("utf-8"))
+        sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in config["ports"]]
+        for each, port in zip(sockets, config["ports"], strict=True):
+            each.bind(("", port))
+    except OSError as error:
+        log.error(error)
+        return 2
+    return run(options, BUNDLE, config, partial(Stream, sockets=sockets), log)
 
 
 if __name__ == "__main__":

@@ -11,13 +11,12 @@ end of this program or its failure switch nothing.
 
 from __future__ import annotations
 
-import argparse
 import json
 import math
-import signal
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -35,19 +34,10 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Header, String
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
-from hybrid_opt.extras.bundles.programs.bring_up import (
-    AIR,
-    BACK,
-    BLOCK,
-    Looks,
-    Measured,
-    add_options,
-    bring_up,
-    require,
-    unloaded,
-)
+from hybrid_opt.extras.bundles.programs.bring_up import Looks, Measured
 from hybrid_opt.extras.bundles.programs.carry_job import Job, Refused
 from hybrid_opt.extras.bundles.programs.carry_machine import Machine, Moment, Seen
+from hybrid_opt.extras.bundles.programs.carry_program import Carry, options_of, run
 
 BUNDLE = Path(__file__).resolve().parent
 
@@ -66,35 +56,25 @@ LEAD_OF_STOP = 0.04
 SETTLE = 0.5
 """Time to receive messages of both arms before the first check [s]."""
 
-CTRL_C = "Ctrl-C"
-
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)
 """Quality of service for measurements: accepts reliable and best-effort publishers, and keeps no
 queue."""
 
 
-def parts(time: float) -> tuple[int, int]:
-    """Split a time [s] into whole seconds and nanoseconds."""
-    return divmod(round(time * 1e9), 10**9)
+def parts(time: float) -> dict[str, int]:
+    """Split a time [s] into the fields of a ROS time or duration: whole seconds and nanoseconds."""
+    return dict(zip(("sec", "nanosec"), divmod(round(time * 1e9), 10**9), strict=True))
 
 
 def type_of(kind: str) -> Any:
-    """Return the Python class of a ROS message or service.
-
-    Args:
-        kind: its name, PACKAGE/msg/NAME or PACKAGE/srv/NAME.
-    """
+    """Return the Python class of a ROS message PACKAGE/msg/NAME or service PACKAGE/srv/NAME."""
     package, what, name = kind.split("/")
     return getattr(import_module(f"{package}.{what}"), name)
 
 
 def fill(message: Any, values: dict[str, Any]) -> None:
-    """Set the fields of a ROS message from a dictionary.
-
-    Args:
-        message: the message, which is changed in place.
-        values: value of each field by its name. For a field that is itself a message, the value is
-            such a dictionary.
+    """Set the fields of a ROS message from a dictionary; the value of a field that is itself a
+    message is such a dictionary.
 
     Raises:
         AttributeError: the message has no such field.
@@ -106,51 +86,48 @@ def fill(message: Any, values: dict[str, Any]) -> None:
             setattr(message, name, value)
 
 
-class Run:
+class Run(Carry):
     """A run of the job by the controllers of both arms, with ROS names and settings from
     config/cell.json."""
 
     def __init__(
-        self, node: Any, job: Job, config: dict[str, Any], known: Sequence[Measured] | Looks
+        self,
+        job: Job,
+        config: dict[str, Any],
+        known: Sequence[Measured] | Looks,
+        log: Any,
+        node: Any,
     ) -> None:
-        """Subscribe to both arms; nothing is sent yet.
-
-        Args:
-            node: ROS node.
-            job: the job.
-            config: content of config/cell.json.
-            known: measured properties of both arms; or a store of measurements, if the arms are to
-                be measured.
-        """
+        """Subscribe to both arms by a ROS node; nothing is sent yet."""
+        super().__init__(known, log)
         self.node, self.config = node, config
-        self.looks = known if isinstance(known, Looks) else None
-        self._signs = None if isinstance(known, Looks) else [each.sign for each in known]
         self._grips: list[dict[str, Any] | None] = config.get("grip", [None, None])
         self.take(job)
-        self.fault, self.command, self.lost = "", "", False
         self._began, self._last = 0.0, 0.0
         self._q: list[dict[str, float]] = [{}, {}]
-        self._measured = [-math.inf, -math.inf]
         self._force: list[float | None] = [None, None]
-        self._felt = [-math.inf, -math.inf]
         self._holds: list[bool | None] = [None, None]
-        self._told = [-math.inf, -math.inf]
+        # Times of the last postures, forces and inputs of hands.
+        self._measured, self._felt, self._told = ([-math.inf, -math.inf] for _ in range(3))
         self._switched: bool | None = None
         self._goals = 0
         self._calls: list[tuple[str, Any]] = []
         self._clients: dict[str, Any] = {}
         for topic in config["joint_states"]:
             node.create_subscription(JointState, topic, self._joints, NEWEST)
-        for arm, source in enumerate(config["wrench"]):
-            if source is not None:
-                self._listen(arm, source)
-        for arm, grip in enumerate(self._grips):
+        for arm in (0, 1):
+            wrench, grip = config["wrench"][arm], self._grips[arm]
+            if wrench is not None:
+                heard = partial(self._feel, arm, wrench["axis"])
+                node.create_subscription(WrenchStamped, wrench["topic"], heard, NEWEST)
             if grip and grip["input"]:
-                self._listen_to_hands(arm, grip["input"])
+                heard, source = partial(self._hear, arm, grip["input"]["pin"]), grip["input"]
+                node.create_subscription(type_of(source["kind"]), source["topic"], heard, NEWEST)
         node.create_subscription(String, "/carry/command", self._commanded, 10)
-        self._actions = [
-            ActionClient(node, FollowJointTrajectory, group["action"]) for group in config["groups"]
-        ]
+        self._actions = {
+            group["action"]: ActionClient(node, FollowJointTrajectory, group["action"])
+            for group in config["groups"]
+        }
 
     def take(self, job: Job) -> None:
         """Store a job to be run next."""
@@ -160,45 +137,34 @@ class Run:
         self.machine = Machine(job, self.config["lag"], LEAD_OF_STOP, sensors, inputs)
 
     def _joints(self, message: Any) -> None:
+        known = dict(zip(message.name, message.position, strict=False))
         for arm, robot in enumerate(self.job.robots):
-            known = dict(zip(message.name, message.position, strict=False))
             if all(name in known for name in robot["ros_joints"]):
-                self._q[arm] = known
-                self._measured[arm] = self._stamp(message)
+                self._q[arm], self._measured[arm] = known, self._stamp(message)
 
     def _stamp(self, message: Any) -> float:
         """Return the time stamp of a message [s], or the present time if it has none."""
         stamp = message.header.stamp
         return stamp.sec + 1e-9 * stamp.nanosec or self.now()
 
-    def _listen(self, arm: int, source: dict[str, Any]) -> None:
-        axis = source["axis"]
+    def _feel(self, arm: int, axis: Sequence[float], message: Any) -> None:
+        force = message.wrench.force
+        self._force[arm] = axis[0] * force.x + axis[1] * force.y + axis[2] * force.z
+        self._felt[arm] = self._stamp(message)
 
-        def heard(message: Any) -> None:
-            force = message.wrench.force
-            along = axis[0] * force.x + axis[1] * force.y + axis[2] * force.z
-            self._force[arm], self._felt[arm] = along, self._stamp(message)
+    def _hear(self, arm: int, pin: int | None, message: Any) -> None:
+        if pin is None:
+            self._holds[arm] = bool(message.data)
+        else:
+            lines = {line.pin: bool(line.state) for line in message.digital_in_states}
+            self._holds[arm] = lines.get(pin)
+        self._told[arm] = self.now()
 
-        self.node.create_subscription(WrenchStamped, source["topic"], heard, NEWEST)
-
-    def _listen_to_hands(self, arm: int, source: dict[str, Any]) -> None:
-        pin = source["pin"]
-
-        def heard(message: Any) -> None:
-            if pin is None:
-                self._holds[arm] = bool(message.data)
-            else:
-                lines = message.digital_in_states
-                self._holds[arm] = next(
-                    (bool(line.state) for line in lines if line.pin == pin), None
-                )
-            self._told[arm] = self.now()
-
-        self.node.create_subscription(type_of(source["kind"]), source["topic"], heard, NEWEST)
+    def _commanded(self, message: Any) -> None:
+        self.command = message.data.strip()
 
     def _switch(self) -> None:
-        """Call the ROS services that switch the hands, if their commanded state has changed. If a
-        service refuses, this is reported as a fault when its answer arrives."""
+        """Call the services that switch the hands, if their commanded state has changed."""
         if self.machine.grip == self._switched:
             return
         self._switched = self.machine.grip
@@ -209,48 +175,40 @@ class Run:
             if call not in calls[:k]:
                 self.call(*call)
 
-    def _commanded(self, message: Any) -> None:
-        self.command = message.data.strip()
-
     def now(self) -> float:
         """Return the time of the node's clock [s]."""
         return float(self.node.get_clock().now().nanoseconds) * 1e-9
 
     def seen(self) -> Seen:
-        """Return the measured state of the arms now."""
+        """Return the measured state of the arms now. A service that has refused is a fault."""
         for name, future in [call for call in self._calls if call[1].done()]:
             answer = future.result()
             if not getattr(answer, "ok", getattr(answer, "success", answer is not None)):
                 reason = getattr(answer, "error", getattr(answer, "message", ""))
-                self.fault = self.fault or f"{name} was refused: {reason or 'without a reason'}"
+                self.fail(f"{name} was refused: {reason or 'without a reason'}")
         self._calls = [call for call in self._calls if not call[1].done()]
         now, silence = self.now(), self.job.limits.silence
+        force: list[float | None] = [None, None]
+        if self.signs is not None:
+            both = zip(self.signs, self._raw(now), strict=True)
+            force = [None if raw is None else sign * raw for sign, raw in both]
         holds = zip(self._holds, self._told, strict=True)
         return Seen(
             q=[
                 [known[name] for name in robot["ros_joints"]] if known else None
                 for known, robot in zip(self._q, self.job.robots, strict=True)
             ],
-            force=[self._normal_force(arm, now) for arm in (0, 1)],
+            force=force,
             age=[max(0.0, now - then) for then in self._measured],
             grip=[on if now - then <= silence else None for on, then in holds],
             fault=self.fault,
             lost=self.lost,
         )
 
-    def _normal_force(self, arm: int, now: float) -> float | None:
-        """Return the measured normal force of an arm's pad [N]; None without a recent reading, or
-        while the arms are being measured.
-
-        Args:
-            arm: index of the arm.
-            now: time [s].
-        """
-        raw = self._raw(arm, now)
-        return None if raw is None or self._signs is None else self._signs[arm] * raw
-
-    def _raw(self, arm: int, now: float) -> float | None:
-        return self._force[arm] if now - self._felt[arm] <= self.job.limits.silence else None
+    def _raw(self, now: float) -> list[float | None]:
+        """Return the reading of each arm's sensor [N]; None without a recent one."""
+        both, silence = zip(self._force, self._felt, strict=True), self.job.limits.silence
+        return [force if now - then <= silence else None for force, then in both]
 
     def spin(self, until: float) -> None:
         """Handle messages until a time [s]."""
@@ -258,15 +216,8 @@ class Run:
             rclpy.spin_once(self.node, timeout_sec=left)
 
     def wait(self, futures: Sequence[Any], what: str) -> list[Any]:
-        """Wait for ROS futures and return their results, in the same order.
-
-        Args:
-            futures: the futures.
-            what: text for the error message that names what is awaited.
-
-        Raises:
-            Refused: the results take longer than `PATIENCE`.
-        """
+        """Wait for ROS futures and return their results, or raise a `Refused` that names what takes
+        longer than `PATIENCE`."""
         begin = self.now()
         while not all(future.done() for future in futures):
             if self.now() - begin > PATIENCE:
@@ -279,8 +230,7 @@ class Run:
         it arrives.
 
         Args:
-            name: name of the service.
-            kind: type of the service.
+            name, kind: name and type of the service.
             requests: alternative requests for different versions of the driver, each as values of
                 its fields by name. The first that fits the service's type is sent.
 
@@ -293,39 +243,28 @@ class Run:
                 fill(message, request)
             except AttributeError:
                 continue
-            break
-        else:
-            raise Refused(f"{name}: this driver defines another {kind}")
-        future = self._clients[name].call_async(message)
-        self._calls.append((name, future))
-        return future
-
-    def _find(self, name: str, kind: str) -> None:
-        """Find a service, so that a missing one is noticed before anything moves.
-
-        Args:
-            name: name of the service.
-            kind: type of the service.
-
-        Raises:
-            Refused: there is no such service.
-        """
-        self._clients[name] = self.node.create_client(type_of(kind), name)
-        if not self._clients[name].wait_for_service(timeout_sec=PATIENCE):
-            raise Refused(f"{name} is not there; are the controllers launched?")
+            future = self._clients[name].call_async(message)
+            self._calls.append((name, future))
+            return future
+        raise Refused(f"{name}: this driver defines another {kind}")
 
     def prepare(self) -> None:
         """Check the arms, then call the services that config/cell.json lists under `prepare`, in
-        the order of the list.
+        the order of the list. Missing servers are noticed before anything moves.
 
         Raises:
-            Refused: a service is missing or refuses, or an arm is not at its first position.
+            Refused: a server is missing or refuses, or an arm is not at its first position.
         """
-        for group, client in zip(self.config["groups"], self._actions, strict=True):
-            if not client.wait_for_server(timeout_sec=PATIENCE):
-                raise Refused(f"{group['action']} is not there; are the controllers launched?")
-        for call in (*self.config["prepare"], *filter(None, self._grips)):
-            self._find(call["name"], call["kind"])
+        calls = [*self.config["prepare"], *filter(None, self._grips)]
+        self._clients = {
+            call["name"]: self.node.create_client(type_of(call["kind"]), call["name"])
+            for call in calls
+        }
+        waits = {name: client.wait_for_server for name, client in self._actions.items()}
+        waits |= {name: client.wait_for_service for name, client in self._clients.items()}
+        for name, wait in waits.items():
+            if not wait(timeout_sec=PATIENCE):
+                raise Refused(f"{name} is not there; are the controllers launched?")
         self.check()
         for call in self.config["prepare"]:
             self.wait([self.call(**call)], call["name"])
@@ -333,55 +272,39 @@ class Run:
                 raise Refused(self.fault)
 
     def check(self) -> None:
-        """Check that both arms are ready for the job.
-
-        Raises:
-            Refused: an arm is not ready.
-        """
+        """Listen to both arms, and raise a `Refused` if one is not ready for the job."""
         while self.now() == 0.0:
             # A simulator's clock is not there yet.
             rclpy.spin_once(self.node, timeout_sec=PERIOD)
         self.spin(self.now() + SETTLE)
-        self.machine.check(self.seen())
+        super().check()
 
     def send(self, moments: Sequence[Moment], begin: float) -> None:
-        """Send each controller its part of the path, and wait until it is accepted.
-
-        Args:
-            moments: future states of the job on its path.
-            begin: time at which the first state is to be reached [s].
-
-        Raises:
-            Refused: a controller rejects it.
-        """
+        """Send each controller its part of the path, whose first state is reached at the time
+        `begin` [s]. Wait until it is accepted, or raise a `Refused`."""
         goals = [self._goal(group["arms"], moments, begin) for group in self.config["groups"]]
         # Large goals take long to build: none is sent before all are there.
-        both = zip(self._actions, goals, strict=True)
+        both = zip(self._actions.values(), goals, strict=True)
         sent = [client.send_goal_async(goal) for client, goal in both]
         self._goals += 1
-        handles = self.wait(sent, "a controller")
-        taken = dict(zip((g["action"] for g in self.config["groups"]), handles, strict=True))
+        taken = dict(zip(self._actions, self.wait(sent, "a controller"), strict=True))
         refusing = [action for action, handle in taken.items() if not handle.accepted]
         if refusing:
             raise Refused(f"{' and '.join(refusing)} does not take its goal")
-        for group, handle in zip(self.config["groups"], handles, strict=True):
-            handle.get_result_async().add_done_callback(self._ended(group["action"], self._goals))
+        for action, handle in taken.items():
+            ended = partial(self._ended, action, self._goals)
+            handle.get_result_async().add_done_callback(ended)
 
-    def _ended(self, action: str, number: int) -> Any:
-        def ended(future: Any) -> None:
-            done = future.result()
-            if number == self._goals and done.status != GoalStatus.STATUS_SUCCEEDED:
-                reason = done.result.error_string or f"status {done.status}"
-                self.fault = self.fault or f"{action} ended: {reason}"
-                self.lost = True
-
-        return ended
+    def _ended(self, action: str, number: int, future: Any) -> None:
+        done = future.result()
+        if number == self._goals and done.status != GoalStatus.STATUS_SUCCEEDED:
+            reason = done.result.error_string or f"status {done.status}"
+            self.fail(f"{action} ended: {reason}", lost=True)
 
     def _goal(self, arms: Sequence[int], moments: Sequence[Moment], begin: float) -> Any:
         # Without tolerances: a controller that gives up by itself drops the squeeze.
-        sec, nanosec = parts(begin)
         trajectory = JointTrajectory(
-            header=Header(stamp=Time(sec=sec, nanosec=nanosec)),
+            header=Header(stamp=Time(**parts(begin))),
             joint_names=self._joined(arms, [self.job.robots[arm]["ros_joints"] for arm in arms]),
             points=[self._point(arms, moment) for moment in moments],
         )
@@ -389,15 +312,7 @@ class Run:
 
     def _joined(self, arms: Sequence[int], rows: Sequence[Sequence[Any]]) -> list[Any]:
         """Join the values of several arms' joints to one list. A joint that moves both arms is
-        listed once, with its value of the first arm.
-
-        Args:
-            arms: indices of the arms.
-            rows: for each arm the values of its joints.
-
-        Returns:
-            One value for each joint, in the order of the arms.
-        """
+        listed once, with its value of the first arm."""
         found: dict[str, Any] = {}
         for arm, row in zip(arms, rows, strict=True):
             for name, value in zip(self.job.robots[arm]["ros_joints"], row, strict=True):
@@ -408,23 +323,18 @@ class Run:
         job, r = self.job, at.rate
         rates = self._joined(arms, [job.linear(arm, "velocity", at.s) for arm in arms])
         seconds = self._joined(arms, [job.linear(arm, "acceleration", at.s) for arm in arms])
-        sec, nanosec = parts(at.time)
         efforts = [job.effort(arm, "without_gravity", at.s, r) for arm in arms]
         return JointTrajectoryPoint(
             positions=self._joined(arms, [job.position(arm, at.s) for arm in arms]),
             velocities=[r * v for v in rates],
             accelerations=[r * r * a + at.change * v for v, a in zip(rates, seconds, strict=True)],
             effort=self._joined(arms, efforts),
-            time_from_start=Duration(sec=sec, nanosec=nanosec),
+            time_from_start=Duration(**parts(at.time)),
         )
 
     def start(self) -> None:
-        """Send the whole job and start it.
-
-        Raises:
-            Refused: the arms are not ready.
-        """
-        self.machine.start(self.seen())
+        """Send the whole job and start it, or raise a `Refused` if the arms are not ready."""
+        super().start()
         self._begin(1.0)
 
     def _begin(self, rate: float) -> None:
@@ -441,35 +351,34 @@ class Run:
         self.spin(self._began)
         self._last = self._began
 
-    def tick(self) -> None:
-        """Check the arms, and stop them or advance the job."""
-        machine = self.machine
-        before, now, seen = machine.state, self.now(), self.seen()
+    def go_on(self, direction: float) -> None:
+        """Send what lies ahead of a job that continues, and start it."""
+        try:
+            self._begin(direction)
+        except Refused as error:
+            self.hold(error)
+
+    def cycle(self) -> None:
+        """Handle messages for `PERIOD`; check the arms and stop or advance a job that has begun."""
+        self.spin(self.now() + PERIOD)
+        machine, before = self.machine, self.machine.state
+        if before == "ready":
+            return
+        now, seen = self.now(), self.seen()
         machine.tick(now - self._last, seen)
         self._last = now
         if self.looks is not None:
-            self.looks.note(now, machine, seen, [self._raw(arm, now) for arm in (0, 1)])
+            self.looks.note(now, machine, seen, self._raw(now))
         if machine.opened:
-            self._go_on(machine.clock.rate)
+            self.go_on(machine.clock.rate)
         self._switch()
         if before == "running" and machine.state in ("stopping", "landing", "held"):
             self._stop()
         if before == "landing" and machine.state == "running":
-            self._go_on(1.0)
+            self.go_on(1.0)
         if before != machine.state:
-            self.node.get_logger().info(machine.status())
-        if machine.state == "held" and self.command in ("continue", "back"):
-            self._resume(1.0 if self.command == "continue" else -1.0)
-
-    def stop(self, reason: str) -> None:
-        """Stop both arms along the path.
-
-        Args:
-            reason: reason of the stop, for messages.
-        """
-        if self.machine.state == "running":
-            self.machine.stop(reason)
-            self._stop()
+            self.log.info(self.status())
+        self.obey()
 
     def _stop(self) -> None:
         if self.machine.state == "held":
@@ -483,104 +392,28 @@ class Run:
         try:
             self.send(moments, self._began)
         except Refused as error:
-            self.node.get_logger().error(f"{error}; its arm goes on as it was last told")
-
-    def drive(self, part: Job, word: str) -> bool:
-        """Run a part of the job to its end and back, after somebody has typed a word.
-
-        Args:
-            part: the part of the job.
-            word: word that has to be typed at the terminal.
-
-        Returns:
-            True if this run was completed.
-        """
-        self.take(part)
-        self.node.get_logger().info(BLOCK if word else AIR)
-        while self.command != word and not self.fault:
-            self.spin(self.now() + PERIOD)
-        self.check()
-        self.start()
-        if self.look_after():
-            return False
-        self.machine.hold("it goes back")
-        self._resume(-1.0)
-        return self.look_after() == BACK
-
-    def _resume(self, direction: float) -> None:
-        self.command, self.fault, self.lost = "", "", False
-        try:
-            self.machine.resume(direction, self.seen())
-        except Refused as error:
-            self.machine.hold(str(error))
-            self.node.get_logger().error(self.machine.status())
-        else:
-            self._go_on(direction)
-
-    def _go_on(self, direction: float) -> None:
-        try:
-            self._begin(direction)
-        except Refused as error:
-            self.machine.hold(str(error))
-            self.node.get_logger().error(self.machine.status())
-
-    def interrupt(self, *_: object) -> None:
-        """Stop the job on Ctrl-C; if the job already holds, end the program."""
-        if self.machine.state == "held":
-            self.command = "leave"
-        self.fault = self.fault or CTRL_C
+            self.log.error(f"{error}; its arm goes on as it was last told")
 
     def look_after(self) -> int:
-        """Supervise the started job until it ends. Return the exit code."""
-        machine = self.machine
+        """Supervise the started job until it ends; stop both arms if this program fails."""
         try:
-            while machine.state != "done":
-                self.spin(self.now() + PERIOD)
-                self.tick()
-                if machine.state == "held" and self.command == "leave":
-                    self.node.get_logger().error(f"left while {machine.status()}")
-                    return 1
+            return super().look_after()
         except BaseException:
-            self.stop("run_job.py has failed")
+            if self.machine.state == "running":
+                self.machine.stop("run_job.py has failed")
+                self._stop()
             raise
-        return 0 if machine.clock.s > 0.0 else BACK
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the job. Return the exit code, 0 when the job is done.
-
-    Args:
-        arguments: arguments of the command line; None for those of this process.
-    """
-    parser = argparse.ArgumentParser(description=__doc__)
-    add_options(parser)
-    options = parser.parse_args(arguments)
+    """Run the job by the arguments of the command line. Return the exit code, 0 when it is done."""
+    options = options_of(__doc__, arguments)
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     config = json.loads((BUNDLE / "config/cell.json").read_text("utf-8"))
     clock = Parameter("use_sim_time", value=config["simulated"])
     node = rclpy.create_node("run_job", parameter_overrides=[clock])
     try:
-        job, plan = Job.read(BUNDLE / "job.json"), config["plan"]
-        is_free = options.check or options.in_air or options.bring_up
-        looks = Looks()
-        run = Run(node, job, config, looks if is_free else require(BUNDLE, job, plan))
-        for number in (signal.SIGINT, signal.SIGTERM):
-            signal.signal(number, run.interrupt)
-        if options.check:
-            run.check()
-            node.get_logger().info("both arms are at their first places")
-            return 0
-        run.prepare()
-        if options.bring_up:
-            return bring_up(BUNDLE, job, plan, run.drive, looks)
-        if options.in_air:
-            run.take(unloaded(job))
-        run.check()
-        run.start()
-        return run.look_after()
-    except Refused as error:
-        node.get_logger().error(str(error))
-        return 2
+        return run(options, BUNDLE, config, partial(Run, node=node), node.get_logger())
     finally:
         rclpy.shutdown()
 

@@ -313,6 +313,6 @@ def run(
         for name in SHARED:
             sys.modules.pop(Path(name).stem, None)
         spec.loader.exec_module(program)
-        vars(program)["signal"] = signals
+        vars(sys.modules["carry_program"])["signal"] = signals
         prepare(world)
         return program.main(arguments), world

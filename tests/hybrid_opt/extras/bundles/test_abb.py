@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import math
 import re
 import struct
@@ -176,6 +177,9 @@ MEASURED = [Measured(0.03, 0.0, 1.0, 0.0, -1.0, STIFFNESS)] * 2
 """Of arms that are what they were planned to be."""
 
 
+LOG = logging.getLogger(__name__)
+
+
 class Cell:
     """Two controllers that follow late, and a box between two springs.
 
@@ -192,7 +196,7 @@ class Cell:
         files, self.stiffness = files_for(planned), real
         self.job = self.part = Job(json.loads(files["job.json"]))
         self.config = config = json.loads(files["config/egm.json"])
-        self.stream = Stream(self.job, config, MEASURED)
+        self.stream = Stream(self.job, config, MEASURED, LOG)
         self.is_empty, self.sign = False, -1.0
         self.now, self.force = 50.0, 0.0
         self.offset, self.silent = 0.0, [False, False]
@@ -211,7 +215,7 @@ class Cell:
         """Drive a part of the job to its end and back, as the program does."""
         looks = self.stream.looks or Looks()
         self.part, self.is_empty = part, not word
-        self.stream = Stream(part, self.config, looks)
+        self.stream = Stream(part, self.config, looks, LOG)
         assert self.run("done", "held") == "done", self.stream.machine.status()
         self.stream.machine.hold("it goes back")
         self.stream.command = "back"
@@ -244,7 +248,7 @@ class Cell:
             answer = read_robot(stream.answer(arm, 1, self.now)).joints
             self._told[arm].append([math.radians(value) for value in answer])
         if stream.machine.state == "ready":
-            stream.machine.start(stream.seen(self.now))
+            stream.machine.start(stream.seen())
         wanted = self.part.force(stream._arm, s)
         self.record.append((self.now, s, self.force, wanted, q))
 
@@ -353,7 +357,7 @@ def measured(cell: Cell, folder: Path) -> tuple[list[Measured], str]:
     """What the bring-up of a cell finds, and what the program says against the job then."""
     (folder / "job.json").write_text(str(files_for(STIFFNESS)["job.json"]), "utf-8")
     looks, plan, refusal = Looks(), cell.config["plan"], ""
-    cell.stream = Stream(cell.job, cell.config, looks)
+    cell.stream = Stream(cell.job, cell.config, looks, LOG)
     try:
         bring_up(folder, cell.job, plan, cell.drive, looks)
         assert require(folder, cell.job, plan)[0].stiffness > 0.0
@@ -405,6 +409,14 @@ def test_packets_of_others_and_broken_ones_are_dropped_and_counted() -> None:
         assert stream.read(0, data, host) is None
     assert stream.dropped == 5
     assert " 5 packets " in stream.status()
+
+
+def test_ctrl_c_ends_the_wait_for_controllers() -> None:
+    stream = Cell().stream
+    assert stream.missing
+    stream.interrupt()
+    with pytest.raises(Refused, match=r"Ctrl-C"):
+        stream.check()
 
 
 def test_a_pause_of_the_computer_makes_no_arm_jump() -> None:

@@ -16,10 +16,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hybrid_opt.errors import JobError
-from hybrid_opt.timing.jerk import applicable_jerk_limits, time_with_jerk
 from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.timing.records import JerkLimits, Timing, TimingLimits
-from hybrid_opt.timing.solve import check_limits, most_used, time_path
+from hybrid_opt.timing.records import Timing
+from hybrid_opt.timing.solve import check_limits, most_used
 from symbolic.array import Array
 
 SMOOTHING_WIDTH = 0.05
@@ -34,9 +33,6 @@ AVERAGING_STEP = 5e-4
 STEPS_PER_SAMPLE = 4
 """Number of averaging steps between two samples of the carry."""
 
-RESTS = 1e-3
-"""A joint begins or ends at rest if its acceleration there is below this share of its limit."""
-
 _SLOWER = (0.95, 0.5)
 """Factors that are tried as the lower end of the search for the slowdown, the mildest first."""
 
@@ -50,96 +46,16 @@ _INSIDE = 0.01
 """Guesses of the factor keep this share of the interval away from its ends."""
 
 
-def has_rest_at_ends(timing: Timing) -> bool:
-    """Return True if all joint accelerations of a timing are zero at beginning and end, up to a
-    tolerance.
-    """
-    return acceleration_at_ends(timing) <= RESTS
-
-
-def acceleration_at_ends(timing: Timing) -> float:
-    """Compute the largest ratio of a joint acceleration to its limit at the beginning and end of a
-    timing.
-    """
-    carry = timing.driven
-    limit = carry.workcell.stack_joint_limits("acceleration_max")
-    return float((np.abs(carry.stack_arms("q_second")[[0, -1]]) / limit).max())
-
-
-def without_jumps(
-    model: TimingModel, timing: Timing, jerk: JerkLimits | None, width: float = SMOOTHING_WIDTH
-) -> Timing:
-    """Compute a timing of the same path without jumps of the acceleration, within the limits of the
-    given timing. Jobs need such a timing.
-
-    A timing that begins and ends without acceleration is returned unchanged.
-
-    Args:
-        model: timing model of the workcell.
-        timing: drivable timing with path speeds on the grid.
-        jerk: limits on jerk for a new timing of the path; None to smooth the given timing instead.
-        width: half the width of the window over which the timing is averaged [s]; zero returns the
-            given timing.
-
-    Raises:
-        JobError: the smoothed timing exceeds its limits even at half speed, or the limits on jerk
-            cannot be satisfied.
-    """
-    if width == 0.0 or has_rest_at_ends(timing):
-        return timing
-    if jerk is None:
-        return _smoothed(model, timing, width)
-    found = time_with_jerk(model, timing.driven.x, timing.limits, jerk, timing).timing
-    if found.carry is None:
-        raise JobError(f"no timing within the limits on jerk: {found.reason}")
-    return found
-
-
-def driven_limits(model: TimingModel, x: Array) -> TimingLimits:
-    """Return the limits of the timing with which robots drive a carry.
-
-    If the time law is drivable, these are the limits of drivable carries with the force limit in
-    `x`; otherwise the timing is limited by the reference speeds.
-
-    Args:
-        model: timing model of the workcell.
-        x: (n_var,) decision vector of the carry.
-    """
-    if model.workcell.task.law.is_drivable:
-        return model.drive_limits(float(x[-1]))
-    return TimingLimits(reference_speed=True)
-
-
-def driven_timing(model: TimingModel, x: Array) -> Timing:
-    """Compute the timing with which robots drive a carry: the fastest one within `driven_limits`
-    and the workcell's limits, without jumps of acceleration.
-
-    If the path has no timing, the result states why.
-
-    Args:
-        model: timing model of the workcell.
-        x: (n_var,) decision vector of the carry.
-
-    Raises:
-        JobError: the smoothed timing exceeds its limits even at half speed, or the limits on jerk
-            cannot be satisfied.
-    """
-    limits = driven_limits(model, x)
-    timing = time_path(model, x, limits)
-    return (
-        without_jumps(model, timing, applicable_jerk_limits(model.workcell, limits))
-        if timing.ok
-        else timing
-    )
-
-
-def _smoothed(model: TimingModel, timing: Timing, width: float) -> Timing:
+def smoothed(model: TimingModel, timing: Timing, width: float) -> Timing:
     """Average a timing over a window of time, then slow it down until it satisfies its limits.
 
     Args:
         model: timing model of the workcell.
         timing: timing with jumps of acceleration.
         width: half the width of the window [s].
+
+    Raises:
+        JobError: the smoothed timing exceeds its limits even at half speed.
     """
     u, rate, second = _averaged(timing.grid_speed, width)
     motion = model.path_motion(timing.driven.x).interpolate(u)

@@ -1,9 +1,13 @@
-"""Limits along a path as functions of path acceleration and squared speed, for optimisation
-programs."""
+"""What the optimisation programs of timings are made of: limits along a path as functions of path
+acceleration and squared speed, and the convex program of a timing within jerk limits."""
 
 from __future__ import annotations
 
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.robust.path_force import BY_TIMING, PathPoints, robust_path
@@ -13,11 +17,23 @@ from symbolic.array import Array
 from symbolic.contact.registry import command_model
 from symbolic.limits import Limit, limits_of_block
 
+if TYPE_CHECKING:
+    from scipy import sparse
+
+Mask = NDArray[np.bool_]
+
 SPEEDS, PAYLOAD_ACCELERATIONS = limits_of_block("speed"), limits_of_block("cone")
 (JOINT_ACCELERATION,) = limits_of_block("acceleration")
 
 LINEARISED_ABOVE = 0.6
 """Joint torques and pressure shifts below this share of their limits are left out of programs."""
+
+SOLVER_MARGIN = 1e-4
+"""Share of every limit that the program leaves unused for the solver's rounding."""
+
+NEAR_ACTIVE_SHARE = 0.95
+"""Rows that the last coefficients use beyond this share enter a program at once. With 0.4 in its
+place a timing under a force limit, to which most cones are near, took three times as long."""
 
 
 class PathLimits:
@@ -185,3 +201,155 @@ def duration_at_speed_limits(model: TimingModel, motion: PathMotion, limits: Tim
     squared = squared_speed_limit(model, motion, limits)
     slowness = 1.0 / np.sqrt(np.minimum(squared, 1e8))
     return float(np.trapezoid(slowness, motion.parameter))
+
+
+class JerkProgram:
+    """Quadratic program of k coefficients c, with linear rows A c <= b and second-order cones.
+
+    A cone bounds the length of a vector (3,) that is affine in c. Few rows are active at a
+    solution. Each row depends on few neighbouring coefficients, so only these entries of A are
+    stored, from the column `first` on.
+    """
+
+    def __init__(self, k: int) -> None:
+        """Start a program with k coefficients and no rows."""
+        from scipy import sparse
+
+        self._k = k
+        self._linear = [(sparse.csr_array((0, k)), np.zeros(0))]
+        self._cones = [(sparse.csr_array((0, k)), np.zeros((0, 4)))]
+
+    def add_upper_bounds(self, A: Array, b: Array, first: NDArray[np.intp]) -> None:
+        """Add n linear rows A c <= b for spline coefficients c.
+
+        Args:
+            A: (n, width) successive nonzero entries of each row.
+            b: (n,) bounds.
+            first: (n,) index of the coefficient of each row's first entry.
+        """
+        self._linear.append((self._sparse_rows(A, first), b))
+
+    def add_two_sided_bounds(
+        self, A: Array, head: Array | float, bound: Array, first: NDArray[np.intp]
+    ) -> None:
+        """Add the linear rows |A c| <= bound - head . c, m rows with a common right side at each of
+        n points.
+
+        Args:
+            A: (n, m, width) successive nonzero entries of each row.
+            head: (n, 1, width) entries of the vector `head` at each point, for the same
+                coefficients; 0 for a constant right side.
+            bound: (n,) bounds.
+            first: (n,) index of the coefficient of the first entry at each point.
+        """
+        _, m, width = A.shape
+        for sign in (1.0, -1.0):
+            each = (sign * A + head).reshape(-1, width)
+            self.add_upper_bounds(each, np.repeat(bound, m), np.repeat(first, m))
+
+    def add_norm_bounds(
+        self, A: Array, b: Array, head: Array, bound: Array, first: NDArray[np.intp]
+    ) -> None:
+        """Add n second-order cones |A c + b| <= bound - head . c.
+
+        Args:
+            A: (n, 3, width) successive nonzero entries of each cone's three rows.
+            b: (n, 3) constant parts.
+            head: (n, width) entries of the vector `head` of each cone, for the same coefficients.
+            bound: (n,) bounds.
+            first: (n,) index of the coefficient of each cone's first entry.
+        """
+        rows = np.concatenate([head[:, None], -A], axis=1).reshape(-1, A.shape[2])
+        placed = self._sparse_rows(rows, np.repeat(first, 4))
+        self._cones.append((placed, np.column_stack([bound, b])))
+
+    def _sparse_rows(self, A: Array, first: NDArray[np.intp]) -> sparse.csr_array:
+        from scipy import sparse
+
+        n, width = A.shape
+        columns = first[:, None] + np.arange(width)
+        starts = width * np.arange(n + 1)
+        return sparse.csr_array((A.reshape(-1), columns.reshape(-1), starts), shape=(n, self._k))
+
+    @cached_property
+    def rows(self) -> tuple[sparse.csr_array, Array, sparse.csr_array, Array]:
+        """Matrix A and right side b of all linear rows A c <= b; then matrix and constant part of
+        all cones, four rows each: the bound, and the three components of the vector.
+        """
+        from scipy import sparse
+
+        A, b = zip(*self._linear, strict=True)
+        cone_A, cone_b = zip(*self._cones, strict=True)
+        stacked, cones = (sparse.vstack(each, format="csr") for each in (A, cone_A))
+        return stacked, np.concatenate(b), cones, np.concatenate(cone_b)
+
+    def used(self, c: Array, share: float) -> tuple[Mask, Mask]:
+        """Find the linear rows and the cones whose left side exceeds a share of the right side.
+
+        Args:
+            c: (k,) coefficients.
+            share: the share; 1 finds the violated rows and cones.
+
+        Returns:
+            Masks of the linear rows (n_linear,) and of the cones (n_cones,), True for those found.
+        """
+        A, b, cone_A, cone_b = self.rows
+        inside = cone_b - (cone_A @ c).reshape(-1, 4)
+        lengths = np.linalg.norm(inside[:, 1:], axis=1)
+        return np.asarray(A @ c > share * b), np.asarray(lengths > share * inside[:, 0])
+
+    def minimise(self, H: Array, g: Array, about: Array) -> Array | None:
+        """Minimise c^T H c / 2 + g . c over spline coefficients c (k,), subject to all rows and
+        cones.
+
+        The program is solved with few rows, and again with the violated rows added, until no row is
+        violated.
+
+        Args:
+            H: (k, k) matrix of the objective.
+            g: (k,) vector of the objective.
+            about: (k,) coefficients near the solution; rows that they nearly use enter at once.
+
+        Returns:
+            Coefficients (k,); None if the solver fails.
+        """
+        rows, cones = self.used(about, NEAR_ACTIVE_SHARE)
+        while True:
+            c = self._solve_subset(H, g, about, rows, cones)
+            if c is None:
+                return None
+            more_rows, more_cones = self.used(c, 1.0 + SOLVER_MARGIN / 2.0)
+            fresh = (more_rows & ~rows).any() or (more_cones & ~cones).any()
+            if not fresh:
+                return c
+            rows, cones = rows | more_rows, cones | more_cones
+
+    def _solve_subset(
+        self, H: Array, g: Array, scale: Array, rows: Mask, cones: Mask
+    ) -> Array | None:
+        """Minimise c^T H c / 2 + g . c over coefficients c (k,), subject only to the rows and cones
+        that are marked True; None if the solver fails. `scale` (k,) holds typical sizes of the
+        coefficients; the solver's variables are c / scale."""
+        # Not imported at the top: only jerk limits need it.
+        import clarabel
+        from scipy import sparse
+
+        linear, b, cone_A, cone_b = self.rows
+        settings = clarabel.DefaultSettings()
+        settings.verbose = False
+        kinds: list[Any] = [clarabel.NonnegativeConeT(int(rows.sum()))]
+        kinds += [clarabel.SecondOrderConeT(4)] * int(cones.sum())
+        A = sparse.vstack([linear[rows], cone_A[np.repeat(cones, 4)]], format="csc")
+        A.data *= np.repeat(scale, np.diff(A.indptr))
+        A.eliminate_zeros()
+        found = clarabel.DefaultSolver(
+            sparse.csc_matrix(np.triu(H * np.outer(scale, scale))),
+            g * scale,
+            sparse.csc_matrix(A),
+            np.concatenate([b[rows], cone_b[cones].reshape(-1)]),
+            kinds,
+            settings,
+        ).solve()
+        answer = np.array(found.x) * scale
+        solved = str(found.status) in ("Solved", "AlmostSolved") and np.isfinite(answer).all()
+        return answer if solved else None
