@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_opt.polishing.cell import CarryReader, SmoothCell
-from hybrid_opt.polishing.constraints.active import RowSelector
+from hybrid_opt.polishing.constraints.kinds import RowSelector
 from hybrid_opt.polishing.intervals import (
     NEGLIGIBLE_MULTIPLIER,
     IntervalGrid,

@@ -24,11 +24,16 @@ from typing import Literal
 import numpy as np
 
 from hybrid_opt.polishing.cell import CarryReader, PlacedCarry, SmoothCell
-from hybrid_opt.polishing.constraints.active import RowSelector
-from hybrid_opt.polishing.constraints.kinds import MinimisedForces
+from hybrid_opt.polishing.constraints.kinds import RowSelector
 from hybrid_opt.polishing.front import Solution
 from hybrid_opt.polishing.point import Iterate, Step, StepEvaluation, StepMethod, TrustRegionSolve
-from hybrid_opt.polishing.rows import PROGRAM_BRANCH, ConstraintRows, Row, RowLayout
+from hybrid_opt.polishing.rows import (
+    PROGRAM_BRANCH,
+    ConstraintRows,
+    MinimisedForces,
+    Row,
+    RowLayout,
+)
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.solvers.base import Residuals, Solve, optimality_residuals
 from hybrid_opt.polishing.solvers.dense import dense

@@ -16,17 +16,16 @@ Source: Conn, Gould and Toint, Trust-Region Methods (2000).
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 import numpy as np
 
 from hybrid_opt.polishing.cell import CarryReader, PlacedCarry, SmoothCell
-from hybrid_opt.polishing.constraints.active import RowSelector, WorkingSet
-from hybrid_opt.polishing.constraints.kinds import MinimisedForces
+from hybrid_opt.polishing.constraints.kinds import RowSelector
 from hybrid_opt.polishing.front import Solution
-from hybrid_opt.polishing.rows import PathRow, Row
+from hybrid_opt.polishing.rows import MinimisedForces, PathRow, Row
 from hybrid_opt.polishing.solvers.base import Residuals
 from symbolic.array import Array
 
@@ -45,6 +44,12 @@ BOUNDED_SHARE = 0.9
 
 HIGH_RATIO, LOW_RATIO = 0.7, 0.3
 """Reduction ratios above which the radius may grow, and below which it shrinks."""
+
+LEAST_TIGHTENING = 1e-4
+"""Smallest rise of a required value that counts as new [m, rad, 1]."""
+
+ACTIVE_ROW_LIFETIME = 3
+"""Number of programs for which a row stays in the working set after it was last active."""
 
 
 class TrustRegion:
@@ -285,6 +290,116 @@ class StepMethod(ABC, Generic[AnyIterate, AnyStep]):
             trial: candidate after the step.
         """
         return set()
+
+
+class WorkingSet:
+    """Rows (scalar inequalities) that a solve keeps in its programs, besides the rows that are near
+    their bounds.
+
+    These are rows that a rejected step violated, each with the value that it has to exceed, and
+    rows that were active in one of the last programs.
+
+    A rejected step tightens the bounds of the rows that it violates. These bounds hold at the end
+    of the rejected step. Bounds of distances are not smooth, so a much shorter step need not
+    satisfy them. Therefore only a share of the tightening counts: the share of the way to the
+    rejected candidate that the trust region covers. With the full tightening, the only feasible
+    step in a small region would lead to that candidate.
+
+    Rows are at local minima along the path. Where two minima are equally low, each step would raise
+    the one with a row and lower the other, without end. Therefore, in the polish of drivable
+    carries, active rows stay in the working set while steps are short. After a long step they are
+    dropped, since they would hold the payload on its former side of an edge.
+    """
+
+    def __init__(self, active: RowSelector, half: Array) -> None:
+        """Start with no rows.
+
+        Args:
+            active: selector of rows, which knows whether a row's tightened bound stays valid at
+                other candidates.
+            half: (n,) half ranges of the variables that steps change [m, rad].
+        """
+        self._active, self._half = active, half
+        self._tightened: dict[Row, tuple[float, Array]] = {}
+        self._active_for: dict[Row, int] = {}
+
+    @property
+    def rows(self) -> set[Row]:
+        """All rows (scalar inequalities) of the next program apart from those near their bounds."""
+        return {*self._tightened, *self._active_for}
+
+    def tighten(self, required: dict[Row, float], x: Array, radius: float) -> None:
+        """Raise the values that rows (scalar inequalities) have to exceed in the next step towards
+        the tightened bounds that rejected steps gave them.
+
+        Only a share of the difference between tightened bound and value is added: the radius of the
+        trust region over the distance to the candidate at which the bound was tightened, at most 1.
+
+        Args:
+            required: value that each row has to exceed, changed in place.
+            x: decision vector from which the next step starts; its first n entries are the
+                variables that steps change.
+            radius: radius of the trust region [half ranges of the variables].
+        """
+        for row, (value, tightened_at) in self._tightened.items():
+            n = len(self._half)
+            far = float(np.abs((tightened_at[:n] - x[:n]) / self._half).max())
+            share = min(1.0, radius / max(far, 1e-300))
+            required[row] += share * max(value - required[row], 0.0)
+
+    def learn_from_rejection(
+        self, bounds: Mapping[Row, float], x: Array, required: Mapping[Row, float]
+    ) -> bool:
+        """Add the rows (scalar inequalities) that a rejected step violates.
+
+        Args:
+            bounds: tightened bound of each violated row.
+            x: (n_var,) decision vector after the step.
+            required: value that each row of the program had to exceed.
+
+        Returns:
+            True if any row is new, or if its bound rises by more than `LEAST_TIGHTENING`.
+        """
+        is_new = False
+        for row, value in bounds.items():
+            tightened = self._tightened[row][0] if row in self._tightened else -np.inf
+            is_new |= value > max(required.get(row, -np.inf), tightened) + LEAST_TIGHTENING
+            if value > tightened:
+                self._tightened[row] = value, x
+        return is_new
+
+    def add(self, rows: Iterable[Row], x: Array) -> None:
+        """Add rows (scalar inequalities) that the optimisation problem of a step lacked, without
+        tightening their bounds.
+
+        Args:
+            rows: the missing rows.
+            x: (n_var,) decision vector after the step.
+        """
+        self._tightened.update(dict.fromkeys(rows, (-np.inf, x)))
+
+    def mark_active(self, rows: Iterable[Row]) -> None:
+        """Keep rows (scalar inequalities) in the optimisation problems of the next
+        `ACTIVE_ROW_LIFETIME` steps.
+
+        Args:
+            rows: rows that have a nonzero multiplier in the last step.
+        """
+        left = {row: count - 1 for row, count in self._active_for.items() if count > 1}
+        self._active_for = left | dict.fromkeys(rows, ACTIVE_ROW_LIFETIME)
+
+    def on_new_best(self, keep_active_set: bool = False) -> None:
+        """Discard the tightened bounds that are relative to the former best candidate, because a
+        better one was found.
+
+        Args:
+            keep_active_set: False to discard also the rows that were active in the last programs.
+        """
+        if not keep_active_set:
+            self._active_for = {}
+        self._tightened = {
+            row: v for row, v in self._tightened.items() if self._active.persists(row)
+        }
 
 
 class TrustRegionSolve(Generic[AnyIterate, AnyStep]):

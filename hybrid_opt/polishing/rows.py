@@ -1,4 +1,5 @@
-"""Rows of a smooth program: their values, slopes and weighted curvature.
+"""Rows of a smooth program: the kinds of constraints that choose them; their values, slopes and
+weighted curvature.
 
 A row belongs to a sample or to a point of the path. Forces and pressure at samples are functions of
 the decision vector; rows at a point depend on the box pose and its rate there, which are linear in
@@ -10,22 +11,26 @@ many small arrays, the assembly takes longer than the functions themselves.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
-from typing import Any
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from codegen.function import NumericFunction, PreparedBatch
-from hybrid_opt.polishing.cell import SmoothCell
+from hybrid_opt.polishing.cell import PlacedCarry, SmoothCell
 from hybrid_opt.polishing.functions import PolishFunctions
 from hybrid_opt.polishing.solvers.base import native
 from symbolic.array import Array
 from symbolic.records.task import POSE_SIZE
 from symbolic.smooth.path_points import ORDERS, PathConstraint
 from symbolic.smooth.samples import QUANTITY_WIDTHS, Quantity, grasp_force_name, sample_name
+
+PATCH_MARGIN = 1e-6
+"""Margin to the rim of a patch, in the square of shift over radius."""
 
 PROGRAM_BRANCH = 5
 """Number of the branch of a force row if a convex program computes the force; the paper's five
@@ -452,3 +457,97 @@ def row_numbers(
     """
     numbers = np.array([functions.numbers(constraint) for constraint in constraints])
     return (numbers,) if numbers.shape[1] else ()
+
+
+# --- kinds of constraints ---
+
+
+MinimisedForces = tuple[bool, bool]
+"""For each robot, True if its force is minimised, False if it is only used to break ties."""
+
+AnyRow = TypeVar("AnyRow", ForceRow, PressureRow, PathRow)
+
+
+class ConstraintKind(ABC, Generic[AnyRow]):
+    """One kind of constraint: selects its rows (scalar inequalities) near a candidate, and sets
+    their bounds.
+
+    Attributes:
+        cell: shared data of the polish of a workcell.
+        grid: points along the path.
+        persists: True if tightened bounds stay valid at other candidates. If False, they are
+            relative to the candidate at which they were measured.
+    """
+
+    persists: bool = False
+
+    def __init__(self, cell: SmoothCell) -> None:
+        self.cell, self.grid = cell, cell.grid
+
+    @abstractmethod
+    def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[AnyRow]:
+        """Return the rows (scalar inequalities) of this kind that are near their bounds at a
+        candidate.
+
+        Args:
+            carry: the candidate, evaluated at points of the path.
+            limits: for each robot, True if its normal force is minimised.
+        """
+
+    @abstractmethod
+    def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[AnyRow]:
+        """Return the rows (scalar inequalities) of this kind that are violated after a step.
+
+        Args:
+            carry: candidate after the step.
+            known: candidate before the step.
+        """
+
+    def required_values(
+        self, carry: PlacedCarry, rows: Sequence[AnyRow], is_relaxed: bool = False
+    ) -> list[float]:
+        """Return the value that each row (scalar inequality) has to exceed in the optimisation
+        problem of a step.
+
+        Args:
+            carry: the candidate from which the step starts, evaluated at points of the path.
+            rows: the rows.
+            is_relaxed: True to require no larger distance between bodies than the candidate has.
+        """
+        return [PATCH_MARGIN] * len(rows)
+
+    def tightened_bounds(
+        self, carry: PlacedCarry, known: PlacedCarry, rows: Sequence[AnyRow], before: list[float]
+    ) -> list[float]:
+        """Return the new, stricter bound of each row (scalar inequality) that a step violated.
+
+        Args:
+            carry: candidate after the step.
+            known: candidate before the step.
+            rows: the violated rows.
+            before: bound of each row in the last quadratic program, 0 for a row that was not in it.
+        """
+        return self.required_values(carry, rows)
+
+
+def smooth_values(cell: SmoothCell, carry: PlacedCarry, rows: Sequence[PathRow]) -> Array:
+    """Compute the values of rows (scalar inequalities) by the smooth model at a candidate.
+
+    Args:
+        cell: shared data of the polish.
+        carry: the candidate, evaluated at points of the path.
+        rows: n rows at points that both arms reach.
+
+    Returns:
+        (n,) values in the units of their constraints [m, rad or none].
+    """
+    values = np.empty(len(rows))
+    functions, groups = cell.functions, dict[NumericFunction, list[int]]()
+    for k, row in enumerate(rows):
+        groups.setdefault(functions.row(row.constraint, "first"), []).append(k)
+    for function, members in groups.items():
+        at = [rows[k].point for k in members]
+        inputs = [array[at] for array in (carry.pose, carry.rate, *carry.q)]
+        inputs += row_numbers([rows[k].constraint for k in members], functions)
+        values[members] = function.batch(*inputs)["value"]
+    return values

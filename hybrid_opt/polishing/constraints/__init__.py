@@ -1,2 +1,2 @@
-"""Constraints of the polish, one file per kind: rows near their bounds, required values, violated
-rows."""
+"""Constraints of the polish: rows near their bounds, required values, violated rows. `distances`
+has those of distances, `kinds` all others and the selection among them."""

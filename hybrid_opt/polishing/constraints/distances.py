@@ -18,13 +18,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hybrid_opt.polishing.cell import PlacedCarry, SmoothCell, local_minima_below
-from hybrid_opt.polishing.constraints.kinds import (
+from hybrid_opt.polishing.rows import (
     PATCH_MARGIN,
     ConstraintKind,
     MinimisedForces,
+    PathRow,
     smooth_values,
 )
-from hybrid_opt.polishing.rows import PathRow
 from symbolic.array import Array
 from symbolic.smooth.passage import AxisSwitchGap, SeparatingAxisGap
 from symbolic.smooth.path_points import Clearance

@@ -1,25 +1,38 @@
-"""Kinds of constraints: rows near their bounds, their required values, and violated rows.
+"""Kinds of constraints: rows near their bounds, their required values, and violated rows; and the
+selection of a program's rows among them.
 
-To add a kind, write a class here and list it in `hybrid_opt.polishing.constraints.active`.
+To add a kind, write a class here, or beside the distances, and list it in `RowSelector`.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
-from typing import Generic, TypeVar
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from codegen.function import NumericFunction
 from hybrid_opt.polishing.cell import PlacedCarry, SmoothCell, local_minima_below
-from hybrid_opt.polishing.rows import PROGRAM_BRANCH, ForceRow, PathRow, PressureRow, row_numbers
+from hybrid_opt.polishing.constraints.distances import (
+    AxisSwitchGaps,
+    Clearances,
+    DistanceConstraintKind,
+    SeparatingAxisGaps,
+)
+from hybrid_opt.polishing.rows import (
+    PATCH_MARGIN,
+    PROGRAM_BRANCH,
+    ConstraintKind,
+    ForceRow,
+    MinimisedForces,
+    PathRow,
+    PressureRow,
+    Row,
+    smooth_values,
+)
 from symbolic.array import Array
 from symbolic.contact.registry import contact_model
-from symbolic.smooth.path_points import JointLimit, ManipulabilityLimit, Side
-
-PATCH_MARGIN = 1e-6
-"""Margin to the rim of a patch, in the square of shift over radius."""
+from symbolic.smooth.passage import AxisSwitchGap, SeparatingAxisGap
+from symbolic.smooth.path_points import Clearance, JointLimit, ManipulabilityLimit, Side
 
 SAMPLING_MARGIN = 2e-3
 """Margin to joint limits [rad], and to singularities in the square of |det J| over its least
@@ -60,73 +73,6 @@ stride."""
 
 LOST_ARM_STRIDE = 0.04
 """If an arm loses the path, rows follow this point at this distance and at twice this distance."""
-
-MinimisedForces = tuple[bool, bool]
-"""For each robot, True if its force is minimised, False if it is only used to break ties."""
-
-AnyRow = TypeVar("AnyRow", ForceRow, PressureRow, PathRow)
-
-
-class ConstraintKind(ABC, Generic[AnyRow]):
-    """One kind of constraint: selects its rows (scalar inequalities) near a candidate, and sets
-    their bounds.
-
-    Attributes:
-        cell: shared data of the polish of a workcell.
-        grid: points along the path.
-        persists: True if tightened bounds stay valid at other candidates. If False, they are
-            relative to the candidate at which they were measured.
-    """
-
-    persists: bool = False
-
-    def __init__(self, cell: SmoothCell) -> None:
-        self.cell, self.grid = cell, cell.grid
-
-    @abstractmethod
-    def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[AnyRow]:
-        """Return the rows (scalar inequalities) of this kind that are near their bounds at a
-        candidate.
-
-        Args:
-            carry: the candidate, evaluated at points of the path.
-            limits: for each robot, True if its normal force is minimised.
-        """
-
-    @abstractmethod
-    def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[AnyRow]:
-        """Return the rows (scalar inequalities) of this kind that are violated after a step.
-
-        Args:
-            carry: candidate after the step.
-            known: candidate before the step.
-        """
-
-    def required_values(
-        self, carry: PlacedCarry, rows: Sequence[AnyRow], is_relaxed: bool = False
-    ) -> list[float]:
-        """Return the value that each row (scalar inequality) has to exceed in the optimisation
-        problem of a step.
-
-        Args:
-            carry: the candidate from which the step starts, evaluated at points of the path.
-            rows: the rows.
-            is_relaxed: True to require no larger distance between bodies than the candidate has.
-        """
-        return [PATCH_MARGIN] * len(rows)
-
-    def tightened_bounds(
-        self, carry: PlacedCarry, known: PlacedCarry, rows: Sequence[AnyRow], before: list[float]
-    ) -> list[float]:
-        """Return the new, stricter bound of each row (scalar inequality) that a step violated.
-
-        Args:
-            carry: candidate after the step.
-            known: candidate before the step.
-            rows: the violated rows.
-            before: bound of each row in the last quadratic program, 0 for a row that was not in it.
-        """
-        return self.required_values(carry, rows)
 
 
 class Forces(ConstraintKind[ForceRow]):
@@ -428,24 +374,137 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
         return [(old + new) / 2.0 for old, new in zip(before, has.tolist(), strict=True)]
 
 
-def smooth_values(cell: SmoothCell, carry: PlacedCarry, rows: Sequence[PathRow]) -> Array:
-    """Compute the values of rows (scalar inequalities) by the smooth model at a candidate.
+class RowSelector:
+    """Chooses which rows (single scalar inequalities) a program contains near a candidate.
 
-    Args:
-        cell: shared data of the polish.
-        carry: the candidate, evaluated at points of the path.
-        rows: n rows at points that both arms reach.
-
-    Returns:
-        (n,) values in the units of their constraints [m, rad or none].
+    A row is kept if it is near its bound, or if a step violated it. In drivable cells no row
+    belongs to a sample, because `hybrid_opt.polishing.drive` limits the forces of the timing.
     """
-    values = np.empty(len(rows))
-    functions, groups = cell.functions, dict[NumericFunction, list[int]]()
-    for k, row in enumerate(rows):
-        groups.setdefault(functions.row(row.constraint, "first"), []).append(k)
-    for function, members in groups.items():
-        at = [rows[k].point for k in members]
-        inputs = [array[at] for array in (carry.pose, carry.rate, *carry.q)]
-        inputs += row_numbers([rows[k].constraint for k in members], functions)
-        values[members] = function.batch(*inputs)["value"]
-    return values
+
+    def __init__(self, cell: SmoothCell) -> None:
+        self.forces = Forces(cell)
+        self._movable = cell.grid.movable
+        self._distances = Clearances(cell)
+        sampled: dict[type, ConstraintKind[Any]] = {ForceRow: self.forces}
+        if cell.has_pressure_limit:
+            sampled[PressureRow] = Pressure(cell)
+        driven = cell.task.law.is_drivable
+        self._kinds: dict[type, ConstraintKind[Any]] = ({} if driven else sampled) | {
+            Clearance: self._distances,
+            SeparatingAxisGap: SeparatingAxisGaps(cell),
+            AxisSwitchGap: AxisSwitchGaps(cell),
+            JointLimit: JointLimits(cell),
+            ManipulabilityLimit: ManipulabilityLimits(cell),
+        }
+
+    def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> set[Row]:
+        """Return the rows (scalar inequalities) of all kinds of constraints that are near their
+        bounds at a candidate.
+
+        Args:
+            carry: the candidate, evaluated at points of the path.
+            limits: for each robot, True if its normal force is minimised.
+        """
+        rows = set[Row]()
+        for kind in self._kinds.values():
+            for row in kind.near_rows(carry, limits):
+                if self._counts(row):
+                    rows.add(row)
+        return rows
+
+    def violated_rows(
+        self, carry: PlacedCarry, known: PlacedCarry, program_rows: Collection[Row]
+    ) -> set[Row]:
+        """Return the rows (scalar inequalities) of all kinds of constraints that are violated after
+        a step.
+
+        Args:
+            carry: candidate after the step.
+            known: candidate before the step.
+            program_rows: rows of the optimisation problem whose solution is the step. Force rows
+                among these never count as violated, because a force above its peak only raises the
+                peak.
+        """
+        rows = set[Row]()
+        for kind in self._kinds.values():
+            for row in kind.violated_rows(carry, known):
+                is_peak = isinstance(row, ForceRow) and row in program_rows
+                if self._counts(row) and not is_peak:
+                    rows.add(row)
+        return rows
+
+    def has_violation(
+        self, carry: PlacedCarry, known: PlacedCarry, program_rows: Collection[Row]
+    ) -> bool:
+        """Return True if a candidate violates any constraint after a step.
+
+        Distances are the most expensive, so they are checked last and only until one is too small.
+
+        Args:
+            carry: candidate after the step.
+            known: candidate before the step.
+            program_rows: rows of the program that proposed the step. Force rows among these never
+                count as violated.
+        """
+        return any(
+            row not in program_rows or not isinstance(row, ForceRow)
+            for kind in self._kinds.values()
+            if not isinstance(kind, DistanceConstraintKind)
+            for row in kind.violated_rows(carry, known)
+            if self._counts(row)
+        ) or not carry.distances.exceed(self._distances.least)
+
+    def required_values(
+        self, carry: PlacedCarry, rows: Iterable[Row], is_relaxed: bool = False
+    ) -> dict[Row, float]:
+        """Return the value that each row (scalar inequality) has to exceed in the optimisation
+        problem of the next step.
+
+        Args:
+            carry: the candidate from which the step starts.
+            rows: rows of this optimisation problem.
+            is_relaxed: True to require no larger distance between bodies than the candidate has.
+        """
+        values: dict[Row, float] = {}
+        for kind, own in self._by_kind(rows).items():
+            values.update(zip(own, kind.required_values(carry, own, is_relaxed), strict=True))
+        return values
+
+    def tightened_bounds(
+        self,
+        carry: PlacedCarry,
+        known: PlacedCarry,
+        rows: Iterable[Row],
+        before: Mapping[Row, float],
+    ) -> dict[Row, float]:
+        """Return the new, stricter bound of each row (scalar inequality) that a step violated.
+
+        Args:
+            carry: candidate after the step.
+            known: candidate before the step.
+            rows: the violated rows.
+            before: bound of each row in the last quadratic program, by row.
+        """
+        values: dict[Row, float] = {}
+        for kind, own in self._by_kind(rows).items():
+            margins = [before.get(row, 0.0) for row in own]
+            values.update(zip(own, kind.tightened_bounds(carry, known, own, margins), strict=True))
+        return values
+
+    def persists(self, row: Row) -> bool:
+        """Return True if the tightened bound of a row (scalar inequality) remains valid when the
+        best candidate changes; False if it applies only to the candidate at which it was measured.
+        """
+        return self._kind_of(row).persists
+
+    def _kind_of(self, row: Row) -> ConstraintKind[Any]:
+        return self._kinds[type(row.constraint) if isinstance(row, PathRow) else type(row)]
+
+    def _counts(self, row: Row) -> bool:
+        return not isinstance(row, PathRow) or self._movable(row.point)
+
+    def _by_kind(self, rows: Iterable[Row]) -> dict[ConstraintKind[Any], list[Row]]:
+        groups: dict[ConstraintKind[Any], list[Row]] = {}
+        for row in rows:
+            groups.setdefault(self._kind_of(row), []).append(row)
+        return groups

@@ -18,7 +18,7 @@ from hybrid_opt.polishing.cell import (
     interpolate_minima,
     local_minima_below,
 )
-from hybrid_opt.polishing.constraints.active import RowSelector
+from hybrid_opt.polishing.constraints.kinds import RowSelector
 from symbolic.array import Array
 from symbolic.records.task import initial_decision
 from tests.hybrid_opt.polishing.cells import smooth_cell

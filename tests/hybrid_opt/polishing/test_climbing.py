@@ -12,9 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybrid_opt.polishing.cell import PlacedCarry
-from hybrid_opt.polishing.constraints.active import ACTIVE_ROW_LIFETIME, RowSelector, WorkingSet
 from hybrid_opt.polishing.constraints.distances import Gaps, edges, passing, separation
+from hybrid_opt.polishing.constraints.kinds import RowSelector
 from hybrid_opt.polishing.point import (
+    ACTIVE_ROW_LIFETIME,
     LARGEST_RADIUS,
     Iterate,
     Step,
@@ -22,6 +23,7 @@ from hybrid_opt.polishing.point import (
     StepMethod,
     TrustRegion,
     TrustRegionSolve,
+    WorkingSet,
 )
 from hybrid_opt.polishing.rows import PathRow, Row
 from hybrid_opt.polishing.solvers.base import UNKNOWN
