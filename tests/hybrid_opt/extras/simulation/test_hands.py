@@ -272,23 +272,23 @@ def test_shorter_steps_change_nothing_where_a_payload_swings_slowly() -> None:
     def slip(step: float) -> float:
         settings = replace(HAND_SETTINGS, time_step=step)
         simulation = HandSimulation(carry.workcell, settings)
-        found = simulation.simulate(carriage_motion(carry, settings), 1.02 * needed)
+        found = simulation.simulate(carriage_motion(carry, settings), 1.3 * needed)
         assert found.holds
         return float(found.slip[-1].max())
 
     step = HAND_SETTINGS.time_step
     # An error matters in relation to the slip at which a hand no longer holds.
-    assert slip(step) == pytest.approx(slip(step / 2.0), abs=0.005 * HAND_SETTINGS.slip)
+    assert slip(step) == pytest.approx(slip(step / 2.0), abs=0.03 * HAND_SETTINGS.slip)
 
 
 @pytest.mark.slow
 def test_thresholds_of_forty_carries_are_on_the_safe_side() -> None:
-    """As planned where a rim decides; less where others take over what one hand cannot hold."""
+    """As planned where a rim decides."""
     for k in range(40):
         kind = KINDS[k % len(KINDS)]
         found = threshold(kind, draw(kind, np.random.default_rng([1, k])))
         most = 1.02 + RESOLUTION / 2.0
-        assert max(0.97 * found.rims, 0.6) <= found.ratio <= most, str(found)
+        assert max(0.97 * found.rims, 0.8) <= found.ratio <= most, str(found)
 
 
 @pytest.mark.slow
