@@ -266,17 +266,18 @@ def internal_force_needs(pads: Sequence[Contact], robots: Sequence[int]) -> Arra
 
 
 def _most_sliding(along: Array, torsion: Array, kappa: float) -> float:
-    """Compute an upper bound of t^2 + s^2 + kappa t s over all unit vectors f (3,), where t is the
-    length of `along` f, and s the absolute scalar product of `torsion` and f.
+    """Compute an upper bound of the squared sliding load of condition (2), for a force of 1 N in
+    the worst direction.
 
-    For every q > 0 the product t s is at most half of q t^2 + s^2 / q. The result is the least
-    bound over several q.
+    A force along the unit vector f (3,) causes the tangential force t = |`along` f| and the torsion
+    s = |`torsion` . f|. The bound is one of t^2 + s^2 + kappa t s over all f. For every q > 0 the
+    product t s is at most half of q t^2 + s^2 / q. The result is the least bound over several q.
 
     Args:
         along: (2, 3) tangential force per unit of f.
         torsion: (3,) torsion over the mean distance of the patch's points from its centre, per unit
             of f.
-        kappa: coefficient of the patch.
+        kappa: coefficient of the patch in condition (2).
     """
     first, second = along.T @ along, np.outer(torsion, torsion)
     bounds = (
@@ -306,8 +307,9 @@ class HoldingHands(ContactModel):
 
     @property
     def pad_parameters(self) -> list[dict[str, Any]]:
-        """One dictionary per hand: 'share', its matrix (6, 6) of `layer_shares`; 'opposed', its row
-        (4,) of `internal_force_needs`; 'weaker', the holding force of the weakest hand over the
+        """One dictionary per hand with the fields that `NumberedContact` adds for hands: 'share'
+        (6, 6), the hand's matrix of `layer_shares`; 'opposed' (4,), the hand's row of
+        `internal_force_needs`; and 'weaker', the least holding force of all hands divided by the
         hand's own."""
         pads = self.workcell.pads
         if isinstance(pads[0], NumberedContact):
@@ -323,9 +325,7 @@ class HoldingHands(ContactModel):
     @property
     def problem(self) -> Problem | None:
         """Reason why this contact model does not apply, as (key of the workcell file, message).
-
-        None if every contact is a hand; a pad is a reason.
-        """
+        None if all contacts are hands; a pad has no holding force of its own."""
         pads = [f"contacts[{i}]" for i, c in enumerate(self.workcell.contacts) if c.kind == "pad"]
         if pads:
             return (
@@ -337,8 +337,8 @@ class HoldingHands(ContactModel):
 
     @property
     def level_force(self) -> float:
-        """Largest holding force that any hand needs [N] if the payload is at rest in an upright box
-        frame."""
+        """Largest of the holding forces [N] that the hands of both arms need for a payload at rest,
+        with the z axis of the box vertical."""
         payload, contacts = self.workcell.payload, self.workcell.contacts
         centre = payload.centre_of_mass
         load = ContactLoad(
@@ -351,18 +351,20 @@ class HoldingHands(ContactModel):
         return float(ca.evalf(ca.mmax(self.hold(load).normal)))
 
     def limited_force(self, normal: Array, whole: Array) -> Array:
-        """Return for each arm the force (2,) [N] that its reference force limits: for hands the
-        holding force that the load needs, because the reference force is the holding force.
+        """Return for each arm the force (2,) [N] that must not exceed the arm's reference force.
+        For hands it is the holding force that the load needs.
 
         Args:
-            normal: (2,) needed holding force of each arm's hands [N], which is returned.
+            normal: (2,) holding force that the load needs from each arm's hands [N]; returned
+                unchanged.
             whole: not used.
         """
         return normal
 
     def friction_use(self, normal: Array, tangential: Array) -> Array:
-        """Compute for n motions the largest tangential force of a hand over the friction of its
-        holding force, (n,).
+        """Compute for each of n motions how much of the hands' friction is used: the largest ratio,
+        over samples and arms, of the tangential force to friction coefficient times reference
+        force, (n,).
 
         Args:
             normal: not used.
@@ -378,12 +380,12 @@ class HoldingHands(ContactModel):
         implicit: ImplicitVariables | None = None,
         displaced: bool = False,
     ) -> HeldLoad:
-        """Return the least holding forces for a load, and the wrench with which each arm's hands
-        balance the load.
+        """Compute the least holding forces for a load, and the wrench with which each arm's hands
+        balance it.
 
-        In the result, `normal` is the least holding force of each arm's hands. `tangential` is the
-        part of the load that friction under the holding force must bear, at most friction times
-        `normal`.
+        In the result, `normal` is the least holding force of each arm's hands, stated for the
+        weakest hand. `tangential` is the part of the load that the friction under this holding
+        force has to bear; it is at most friction times `normal`.
 
         Args:
             load: load on the hands of both arms.
@@ -433,7 +435,8 @@ class HoldingHands(ContactModel):
         )
 
     def sharing(self, friction: Expression) -> list[SharingHand]:
-        """Return all hands of both arms, in the order of `Workcell.pads`.
+        """Return all hands of both arms, in the order of `Workcell.pads`, each with the data from
+        which its share of a load and its needed holding force follow.
 
         Args:
             friction: (2,) Coulomb coefficients of the arms' hands.
@@ -460,9 +463,9 @@ class HoldingHands(ContactModel):
 
     @property
     def own_changes(self) -> dict[str, Callable[[Contact], Contact]]:
-        """One change, larger cups, if all hands are cups; else none. Larger cups hold with more
-        force (`strength`).
-        """
+        """Changes of the contacts that an advice to the user may propose, as functions by the text
+        of the advice. If all hands are cups, this is one change: a larger cup at the same vacuum,
+        whose `strength` is higher. Otherwise the dictionary is empty."""
         if any(contact.kind != "cup" for contact in self.workcell.contacts):
             return {}
         return {f"cups {2e3 * LARGER_CUP:.0f} mm larger across at the same vacuum": larger_cup}
@@ -481,30 +484,31 @@ class HoldingHands(ContactModel):
         return 0.0 * apart
 
     def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
-        """Return the worst displacements of the hands under an uncertainty.
+        """Return the worst displacements of the hands under an uncertainty. A displacement of hands
+        counts as an opposite displacement of the centre of mass, so the hands themselves stay in
+        place.
 
         Returns:
-            Half-widths (3,) of the range of the centre of mass along the box axes [m], enlarged by
-            the hands' displacements, because displaced hands shift the centre of mass relative to
-            them; and one case of zero displacements, (1, 4) [m].
+            Half-widths (3,) of the range of the centre of mass along the box axes, the hands'
+            displacements included [m]; and the only case of displaced hands, zeros (1, 4) [m].
         """
         off = uncertainty.pad_position + uncertainty.apart / 2.0
         return uncertainty.centre_of_mass + off, np.zeros((1, 4))
 
     def leading_excess(self, load: ContactLoad, opposed: Expression) -> Expression:
-        """Return zero for any load and any force `opposed` between the arms: the hands of both arms
-        have one common force limit."""
+        """Return zero for any arguments: the force of robot 1 has no part beside `leading_share`
+        times the commanded force, because the hands of both arms hold with the same force."""
         return ca.SX(0.0)
 
     def commanded_forces(
         self, normal: Expression, friction: Expression, tracking: Expression, opposed: Expression
     ) -> Expression:
-        """Compute the holding force [N] that the hands of both arms need, as two equal entries
-        (2,). The force is stated for the weakest hand; a stronger hand holds with more, in
-        proportion to its own holding force.
+        """Compute the holding force [N] that the hands of both arms need in one case of the
+        uncertainty, as two equal entries (2,). The force is that of the weakest hand; a stronger
+        hand holds with more, in proportion to its own holding force.
 
         Args:
-            normal: (2,) least holding force of each arm's hands, stated for the weakest hand [N].
+            normal: (2,) least holding force of each arm's weakest hand [N].
             friction: (2,) Coulomb coefficients of the arms' hands.
             tracking: (2,) share of each arm's holding force that may be missing, for example of a
                 vacuum.
@@ -535,14 +539,15 @@ class HoldingHands(ContactModel):
         return np.full(commanded.shape, self.strength)
 
     def force_use(self, commanded: Array, least: Array) -> dict[str, Array]:
-        """Compute how far needed holding forces use the holding force.
+        """Compute how much of the available holding force the needed holding forces use.
 
         Args:
-            commanded, least: (n, 2) holding forces needed in every case of the uncertainty, and
-                without uncertainty [N].
+            commanded: (n, 2) holding forces needed in every case of the uncertainty [N].
+            least: (n, 2) holding forces needed without uncertainty [N].
 
         Returns:
-            Ratios (n, 2) of a force to its limit, by name of the limit.
+            Ratios (n, 2) of `commanded` and of `least` to the holding force of the weakest hand,
+            under the names 'holding force' and 'least normal force'.
         """
         held = np.maximum(self.held_with(commanded), HELD_FLOOR)
         return {"holding force": commanded / held} | super().force_use(commanded, least)
@@ -560,16 +565,16 @@ class HoldingHands(ContactModel):
         return np.repeat((planned[:, 1 - leader] + extra)[:, None], 2, axis=1)
 
     def pulled_apart(self, along: Array, across: Array, stiffness: float) -> tuple[Array, Array]:
-        """Compute how the forces change if the arms, as springs in series, are displaced against
-        each other.
+        """Compute how a displacement of the hands of both arms against each other changes the
+        forces. Both arms count as springs of equal stiffness in series.
 
         Args:
-            along, across: (n,) displacements of one arm's hands along their normal and across it
-                [m].
+            along, across: (n,) displacement of one arm's hands relative to the other's, along their
+                normal and across it [m].
             stiffness: stiffness of each arm at its hands [N/m].
 
         Returns:
-            Changes (n,) of the holding forces, which are zero, and rises (n,) of the least holding
+            Changes (n,) of the holding forces, which are zero; and rises (n,) of the least holding
             forces for the worst direction of the displacement [N].
         """
         friction = ca.DM([contact.friction for contact in self.workcell.contacts])
@@ -577,8 +582,9 @@ class HoldingHands(ContactModel):
         return 0.0 * along, stiffness / 2.0 * np.hypot(along, across) * most
 
     def _opposed_need(self, friction: Expression) -> Expression:
-        """Compute the largest additional holding force that any hand needs, in newtons per newton
-        with which the arms push against each other.
+        """Compute the additional holding force that the hands need if the arms push against each
+        other, per newton of the push. It is the largest over all hands, each stated for the weakest
+        hand.
 
         Args:
             friction: (2,) Coulomb coefficients of the arms' hands.
@@ -592,8 +598,9 @@ class HoldingHands(ContactModel):
 
 
 def _to_box(T: Expression) -> Expression:
-    """Return the matrix (6, 6) from a wrench about a hand's origin, along its axes, to the wrench
-    about the box frame's origin.
+    """Return the matrix (6, 6) that converts the wrench of a hand to the box frame. The wrench is
+    about the hand's origin, along its axes; the result is about the box frame's origin, along the
+    box's axes.
 
     Args:
         T: (4, 4) pose of the hand in the box frame.

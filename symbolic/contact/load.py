@@ -166,7 +166,8 @@ def _grasp_load_function(workcell: Workcell) -> ca.Function:
 
 
 def _named(inputs: dict[str, ca.MX], outputs: dict[str, ca.MX]) -> ca.Function:
-    """Build the CasADi function `uncertain_load` with the outputs `LOAD_OUTPUTS`.
+    """Build the CasADi function named `uncertain_load` from its inputs and the outputs that
+    `LOAD_OUTPUTS` lists.
 
     Args:
         inputs: symbols by name, in order.
@@ -204,9 +205,10 @@ def required(
 def _sample_function(workcell: Workcell) -> ca.Function:
     """Build the function of the pads' forces at one sample, for pads with any normals.
 
-    Inputs: pose (6,) of the box; required force (3,) and moment (3,) about the centre of mass,
-    world axes; friction (2,); centre_of_mass (3,), box frame; then the payload's symbolic
-    parameters. Outputs: those of `load_function` that `GRASP_OUTPUTS` names.
+    Inputs: pose (6,) of the box [m, rad]; required force (3,) [N] and moment (3,) about the centre
+    of mass [N m], world axes; friction (2,), the Coulomb coefficients; centre_of_mass (3,), box
+    frame [m]; then the payload's symbolic parameters. Outputs: those of `load_function` that
+    `GRASP_OUTPUTS` names.
     """
     inputs, given = [ca.MX.sym(*entry) for entry in SAMPLE_SIZES], mx_parameters(workcell.payload)
     pose, force, moment, friction, centre_of_mass = inputs
@@ -260,13 +262,14 @@ def box_load_function(workcell: Workcell) -> ca.Function:
 
 
 def grasp_world_function(workcell: Workcell) -> ca.Function:
-    """Build the function that converts the wrenches of k pads to forces, shifts of the centres of
-    pressure and unbalanced moments in world axes: those outputs of `load_function` that
-    `GRASP_OUTPUTS` names.
+    """Build the function that converts the wrenches of k pads to contact quantities in world axes.
+    Its outputs are those of `load_function` that `GRASP_OUTPUTS` names: forces, shifts of the
+    centres of pressure, unbalanced moments and the wrench of each robot.
 
-    Inputs: pose (6,) of the box; force (3,) and moment (3,) about the centre of mass that the
-    motion requires, world axes; centre_of_mass (3,), box frame [m]; wrenches (6 k,) as
-    `symbolic.contact.grasp.grasp_wrenches` describes them; then the payload's symbolic parameters.
+    Inputs: pose (6,) of the box [m, rad]; force (3,) [N] and moment (3,) about the centre of mass
+    [N m] that the motion requires, world axes; centre_of_mass (3,), box frame [m]; wrenches (6 k,)
+    of the pads, described in `symbolic.contact.grasp.grasp_wrenches`; then the payload's symbolic
+    parameters.
     """
     pose, _, moment, centre_of_mass = inputs = [ca.SX.sym(*entry) for entry in _ASKED]
     pads, robots = workcell.pads, workcell.pad_robots

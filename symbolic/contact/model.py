@@ -79,8 +79,8 @@ class HeldLoad:
 
     @property
     def wrenches(self) -> Both:
-        """For each contact force [N] and moment [N m] on the payload about the nominal contact
-        point, (6,)."""
+        """Wrench (6,) of each contact on the payload: force [N], then moment about the nominal
+        contact point [N m]."""
         first, second = (ca.vertcat(*pair) for pair in zip(self.forces, self.moments, strict=True))
         return first, second
 
@@ -160,24 +160,26 @@ class ContactModel(ABC):
         self.workcell = workcell
 
     def with_workcell(self, workcell: Workcell) -> ContactModel:
-        """Return the same contact model of another workcell with the same arrangement of pads."""
+        """Return this contact model for another workcell, which must have the same arrangement of
+        pads."""
         return type(self)(workcell)
 
     @property
     def has_scalar_squeeze(self) -> bool:
-        """True if the normal force of one pad determines the normal force of the other. One number,
-        the least squeeze, then states what a case of the uncertainty requires."""
+        """True if the normal force of one pad determines the normal force of the other. A case of
+        the uncertainty then requires a single number, the least squeeze."""
         return self.has_closed_form
 
     @property
     def command_model(self) -> ContactModel:
-        """Contact model with which commanded forces and worst cases are computed."""
+        """Contact model that computes commanded forces and worst cases in place of this one; by
+        default this model itself."""
         return self
 
     @property
     def pad_parameters(self) -> list[dict[str, Any]]:
-        """One dictionary per pad: parameters of the model's formulas that NumPy derives, by name of
-        a field of `NumberedContact`."""
+        """One dictionary per pad with those fields of `NumberedContact` that this model's formulas
+        need beyond the pad's description, by name; by default empty."""
         return [{} for _ in self.workcell.pads]
 
     @property
@@ -190,29 +192,30 @@ class ContactModel(ABC):
 
     @property
     def level_force(self) -> float:
-        """Normal force of each of two pads with horizontal normals that holds the payload at rest
-        [N]."""
+        """Least normal force of each pad [N] that holds the payload at rest, for two pads with
+        horizontal normals."""
         weight = -self.workcell.payload.mass * GRAVITY[2]
         return float(weight / sum(contact.friction for contact in self.workcell.contacts))
 
     def limited_force(self, normal: Array, whole: Array) -> Array:
-        """Return for each robot the force (2,) [N] that its reference force limits: for pads the
-        magnitude of the contact force.
+        """Return for each robot the force (2,) [N] that must not exceed its reference force. For
+        pads it is the magnitude of the whole contact force.
 
         Args:
-            normal: (2,) normal force of each robot [N].
-            whole: (2,) magnitude of each robot's contact force [N].
+            normal: (2,) normal force of each robot [N]; not used.
+            whole: (2,) magnitude of each robot's contact force [N]; returned unchanged.
         """
         return whole
 
     def friction_use(self, normal: Array, tangential: Array) -> Array:
-        """Compute for n motions the largest used share of the friction if both arms hold with their
-        reference forces, (n,).
+        """Compute for each of n motions how much of the friction is used if the arms press as hard
+        as their reference forces allow, (n,). A value above 1 means that the payload slides.
 
-        The least normal forces of pads use the friction fully, by construction. So the forces N_1
-        and N_2 are raised to the reference force, with their difference kept. The needed friction
-        coefficient is the sum of both tangential forces over N_1 + N_2; the result is its ratio to
-        the smaller coefficient.
+        At their least normal forces, pads always use the whole friction. Therefore both normal
+        forces are raised equally, up to the smaller reference force. The needed friction
+        coefficient is the sum of both tangential forces over the sum of both raised normal forces.
+        The result is its largest value over the samples, divided by the smaller coefficient of the
+        pads.
 
         Args:
             normal, tangential: (n, samples, 2) least normal force, and magnitude of the tangential
@@ -235,8 +238,8 @@ class ContactModel(ABC):
 
         Args:
             load: load on both contacts.
-            implicit: collector of results of Newton's method, for exact derivatives; None if no
-                derivatives are needed.
+            implicit: stores the results of Newton's method, so that derivatives of the forces
+                become exact; None if no derivatives are needed.
             displaced: True if `load.arms` may offset the pads laterally from each other.
         """
 
@@ -244,9 +247,8 @@ class ContactModel(ABC):
 
     @property
     def force_branches(self) -> Array:
-        """Coefficients (2, b, 2): for each contact, b linear functions of the two
-        `force_quantities`. The largest value of these functions is the contact's normal force
-        [N]."""
+        """Coefficients (2, b, 2) of b linear functions of the two `force_quantities` for each
+        contact. The contact's normal force is the largest value of its b functions [N]."""
         return np.eye(2)[:, None]
 
     def force_quantities(self, load: ContactLoad, held: HeldLoad) -> Expression:
@@ -268,14 +270,17 @@ class ContactModel(ABC):
     # --- worst cases ---
 
     def least_friction(self, uncertainty: Uncertainty) -> Array:
-        """Compute friction coefficients (2,) so low that forces computed with them hold for every
-        tilt and displacement of the pads, and every loss of friction, in an uncertainty. Zero or
-        negative if no friction is left.
+        """Compute the friction coefficients (2,) that cover the uncertainty of contact: forces
+        computed with them hold for every loss of friction, and every tilt and displacement of the
+        pads. A coefficient is zero or negative if no friction is left.
 
         A pad with friction mu that is tilted by an angle t has the coefficient tan(atan mu - t).
         Pads displaced in opposite directions, by 2 e relative to each other, turn the squeeze into
         a moment. A coefficient lower by 2 e / L, with the distance L of the pads, covers this
         moment.
+
+        Args:
+            uncertainty: ranges of friction, tilt and displacements of the pads.
         """
         friction = np.array([contact.friction for contact in self.workcell.contacts])
         left = np.tan(np.arctan(friction * (1.0 - uncertainty.friction)) - uncertainty.turned)
@@ -334,9 +339,9 @@ class ContactModel(ABC):
         return np.ones(2)
 
     def leading_excess(self, load: ContactLoad, opposed: Expression) -> Expression:
-        """Compute the normal force of robot 1 minus `leading_share` times the commanded force of
-        robot 2 [N]. With two opposite pads it is the component of the load along the normal of
-        contact 1.
+        """Compute the part of robot 1's normal force [N] that does not depend on the commanded
+        force of robot 2: the normal force is this part plus `leading_share` times the commanded
+        force. With two opposite pads it is the component of the load along the normal of contact 1.
 
         Args:
             load: load on both contacts.
@@ -388,10 +393,9 @@ class ContactModel(ABC):
         )
 
     def displacement_margin(self, uncertainty: Uncertainty) -> float:
-        """Return by how much the pads' displacement could exceed that of an uncertainty before
-        forces can no longer be computed [m]; infinite for a model that allows any displacement.
-
-        Zero or negative if the displacement of the uncertainty itself is already too large.
+        """Return how much larger than the uncertainty states the displacement of the pads may
+        become before forces can no longer be computed [m]. It is zero or negative if the stated
+        displacement is already too large, and infinite for a model that allows any displacement.
 
         Args:
             uncertainty: ranges of the uncertain quantities, pad displacements among them.
@@ -402,16 +406,15 @@ class ContactModel(ABC):
 
     @property
     def strength(self) -> float:
-        """Holding force of the weakest hand [N]; 1 for pads. An advice divides the forces of
-        changed cells by it, so that cells with weaker and stronger hands can be compared.
-        """
+        """Holding force of the weakest hand [N]; 1 for pads. For advice, the forces of a changed
+        cell are divided by it, so that cells with weaker and stronger hands can be compared."""
         return 1.0
 
     @property
     def own_changes(self) -> dict[str, Callable[[Contact], Contact]]:
-        """Small changes of the contacts that an advice to the user may propose only with this
-        contact model: functions from a pad to its changed copy, by the text of the advice.
-        """
+        """Changes of the contacts that an advice to the user may propose for this contact model
+        only: functions from a contact to its changed copy, by the text of the advice. By default
+        there are none."""
         return {}
 
     # --- jobs ---
@@ -441,16 +444,18 @@ class ContactModel(ABC):
             commanded, least: (n, 2) commanded and least normal forces of the robots [N].
 
         Returns:
-            Ratios (n, 2) of a force to its limit, by name of the limit.
+            Ratios (n, 2) of a force to its limit, by name of the limit. For pads there is one,
+            'least normal force': the least force over the force that acts.
         """
         return {"least normal force": least / np.maximum(self.held_with(commanded), HELD_FLOOR)}
 
     def pulled_apart(self, along: Array, across: Array, stiffness: float) -> tuple[Array, Array]:
-        """Compute how the forces change if the arms, as springs in series, are displaced against
-        each other.
+        """Compute how a displacement of the two pads against each other changes the forces. Both
+        arms count as springs of equal stiffness in series.
 
         Args:
-            along, across: (n,) displacements of one pad along its normal and across it [m].
+            along, across: (n,) displacement of one pad relative to the other, along its normal and
+                across it [m].
             stiffness: stiffness of each arm at its pad [N/m].
 
         Returns:

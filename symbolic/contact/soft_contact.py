@@ -42,9 +42,8 @@ class SoftFinger(ContactModel):
     @property
     def problem(self) -> Problem | None:
         """Reason why this contact model does not apply, as (key of the workcell file, message).
-
-        None if the lateral offset of the pads is small enough to hold the payload.
-        """
+        None if the pads' lateral offset is below a share of friction times the pads' distance, so
+        that a larger squeeze holds the payload under every motion."""
         friction = min(contact.friction for contact in self.workcell.contacts)
         beside, room = self.workcell.pad_offset, friction * self.workcell.pad_distance
         if beside < PAD_OFFSET_SHARE * room:
@@ -67,8 +66,8 @@ class SoftFinger(ContactModel):
 
         Args:
             load: load on both contacts.
-            implicit: collector of results of Newton's method, for exact derivatives; None if no
-                derivatives are needed.
+            implicit: stores the results of Newton's method, so that derivatives of the forces
+                become exact; None if no derivatives are needed.
             displaced: True if `load.arms` may offset the pads laterally from each other.
         """
         workcell, axes = self.workcell, load.axes
@@ -146,10 +145,9 @@ class SoftFingerGrasp(SoftFinger):
         return uncertainty.centre_of_mass, np.array([off * np.array(at) for at in signs])
 
     def displacement_margin(self, uncertainty: Uncertainty) -> float:
-        """Return by how much the pads' displacement could exceed that of an uncertainty before
-        forces can no longer be computed [m].
-
-        Zero or negative if the displacement of the uncertainty itself is already too large.
+        """Return how much larger than the uncertainty states the displacement of the pads may
+        become before forces can no longer be computed [m]. It is zero or negative if the stated
+        displacement is already too large.
 
         Args:
             uncertainty: ranges of the uncertain quantities, pad displacements among them.

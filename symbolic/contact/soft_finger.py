@@ -81,11 +81,12 @@ class SoftPatch:
 
     @classmethod
     def of(cls, contact: Contact, axes: Array) -> SoftPatch:
-        """Return the patch of a contact, along the tangents of contact 1.
+        """Compute the lengths of a contact's patch that determine its torsion.
 
         Args:
             contact: contact with a round or rectangular patch.
-            axes: (3, 3) tangents and normal of contact 1 in the box frame, as columns.
+            axes: (3, 3) tangents and normal of contact 1 in the box frame, as columns. The field
+                `spread` is along these tangents.
         """
         if isinstance(contact, NumberedContact):
             return cls(contact.twist, contact.spread)
@@ -194,9 +195,9 @@ def least_soft_squeeze(
         friction: (2,) Coulomb coefficients.
         patches: patches of both pads.
         offset: True if the contacts may be laterally offset. Tangential forces and torsion then
-            depend on the squeeze.
-        implicit: collector of results of Newton's method, for exact derivatives; not used with
-            `offset`.
+            depend on the squeeze, which is found by iteration.
+        implicit: stores the results of Newton's method, so that derivatives of the forces become
+            exact; None if no derivatives are needed. Not used with `offset`.
     """
     apart = arms[0] - arms[1]
     # About the middle of the contacts: apart x half the difference of both forces, and torsion.
@@ -252,7 +253,8 @@ def _pressed(
         difference: normal force of contact 1 minus normal force of contact 2 [N].
         friction: (2,) Coulomb coefficients.
         patches: patches of both pads.
-        implicit: collector of results of Newton's method, for exact derivatives; None for none.
+        implicit: stores the results of Newton's method, so that derivatives of the forces become
+            exact; None if no derivatives are needed.
 
     Returns:
         Normal forces (2,) [N]; and the largest torsion (2,) that each pad can bear beside its

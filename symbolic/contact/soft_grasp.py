@@ -60,7 +60,8 @@ class SoftGrasp:
 
         Input: load (6,), force and moment about the box frame's origin, along the box's axes [N, N
         m]. Outputs: normal (2,), normal forces of the robots [N]; slope (6, 2), their derivatives
-        by the load; state (size,) of all patches.
+        by the load; state (size,), the states (scaled wrenches) of all patches at the solution, an
+        input of `second`.
         """
         load, groups = ca.MX.sym("load", LOAD_SIZE), mx_symbols(self.grasp.given)
         state = self.solve(load, groups)
@@ -69,8 +70,8 @@ class SoftGrasp:
         return ca.Function("held_first", inputs, outputs, names, ["normal", "slope", "state"])
 
     def solve(self, load: ca.MX, groups: dict[str, ca.MX]) -> ca.MX:
-        """Build the expression of those states (size,) of all patches that balance a load with the
-        least effort.
+        """Build the expression of the states (size,) of all patches at the solution of the convex
+        program: of all states that balance the load, those on the central path.
 
         Args:
             load: (6,) force and moment about the box frame's origin, along the box's axes [N, N m].
@@ -133,8 +134,8 @@ class SoftGrasp:
         return ca.Function("slopes", inputs, ca.cse([ca.densify(value) for value in outputs]))
 
     def _newton(self) -> ca.Function:
-        """Build the function of one Newton step: from the states (size,) of all patches to states
-        nearer the minimum of the objective f of the module. The load stays balanced."""
+        """Build the function of one Newton step on the module's objective f, at a constant load:
+        from the states (size,) of all patches to states nearer the minimum."""
         state = ca.SX.sym("state", self.size)
         local = _Local(self, state)
         inputs = [state, *self.grasp.given.values()]
@@ -168,8 +169,8 @@ class _Local:
         self._share = 1.0 / (1.0 - ca.dot(self._g, self._answer))
 
     def solve(self, pull: ca.SX) -> ca.SX:
-        """Compute the change (n,) of the states in a Newton step that keeps the load balanced. It
-        is Y y, where y solves Y' F Y y = Y' pull.
+        """Compute the direction (n,) Y y of the states that solves Newton's equations Y' F Y y = Y'
+        pull of the module. A step along it keeps the load balanced.
 
         y is the change of the free components of the states, and Y (n, free_size) the derivative of
         the states by these components. F is the Hessian (n, n) of the objective f (log effort plus
@@ -185,8 +186,9 @@ class _Local:
         return self._with_g(self._equations.constrained(self._loaded))
 
     def _with_g(self, found: ca.SX) -> ca.SX:
-        """Correct solutions of Newton's equations for the rank-one part -g g' of the curvature, by
-        the Sherman-Morrison formula. g (n,) is the gradient of log effort.
+        """Add the effect of the rank-one part -g g' of the Hessian to solutions of Newton's
+        equations without this part, by the Sherman-Morrison formula. g (n,) is the gradient of log
+        effort.
 
         Args:
             found: (n, k) solutions without the rank-one part.
@@ -197,8 +199,9 @@ class _Local:
         return found + ca.mtimes(self._answer, self._share * ca.mtimes(self._g.T, found))
 
     def third(self, along: ca.SX, by_load: ca.SX) -> ca.SX:
-        """Compute the matrix U' T[d] U (6, 6), where T[d] is the derivative along d of the Hessian
-        of the objective f (log effort plus weighted barriers) by the states.
+        """Compute the matrix U' T[d] U (6, 6), from which second derivatives of the normal forces
+        by the load follow. T[d] is the derivative along d of the Hessian of the objective f (log
+        effort plus weighted barriers) by the states.
 
         Args:
             along: (n,) direction d of the states.

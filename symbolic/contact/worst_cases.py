@@ -215,15 +215,16 @@ def case_slack_function(workcell: Workcell, commanded: int = 1) -> ca.Function:
 def _program_and_inputs(
     workcell: Workcell, commanded: int = 1
 ) -> tuple[GraspSqueeze | None, dict[str, Expression]]:
-    """Return the convex program and the input symbols of functions of least normal forces.
+    """Return what functions of the least normal forces in one case of the uncertainty are built
+    from: the convex program that computes the forces, and the symbols of the functions' inputs.
 
     Args:
         workcell: the cell.
-        commanded: index of the robot that is commanded by force.
+        commanded: index of the robot whose force is commanded.
 
     Returns:
-        The convex program that computes the forces of pads with any normals, None for other pads;
-        and the symbols of the functions' inputs by name: motion, case of the uncertainty,
+        The convex program for pads with any normals; None for two opposite pads and for hands,
+        whose forces have formulas. Then the symbols by name: motion, case of the uncertainty,
         parameters.
     """
     if command_model(workcell).has_scalar_squeeze:
@@ -260,13 +261,15 @@ def _least_force(
 
     Args:
         workcell: the workcell.
-        squeeze: convex program of pads at any normals; None for two pads with opposite normals.
+        squeeze: convex program of pads at any normals; None for two pads with opposite normals and
+            for hands.
         inputs: symbols by name: pose, rate, second_rate (6,), case (18,), and parameters by group.
-        implicit: collector of results of Newton's method, for exact derivatives; None for none.
+        implicit: stores the results of Newton's method, so that derivatives of the forces become
+            exact; None if no derivatives are needed.
         differentiable: True for exact first derivatives of the convex program's solution.
         displaced: True if cases include displacements of the pads; only for opposite normals.
-        beside: force and moment (6,) on the box in addition to its load, about the box frame's
-            origin [N, N m]; only with `squeeze`.
+        beside: further force and moment (6,) that is added to the load of the case, about the box
+            frame's origin [N, N m], for derivatives by the load; only with `squeeze`.
     """
     case = inputs["case"]
     friction, *_ = case_parts(case)
@@ -373,8 +376,8 @@ def _commanded_by_program(
 
 
 def _sizes_function(squeeze: GraspSqueeze) -> ca.Function:
-    """Build the function from a case (18,) of the uncertainty to the sizes (2,) of both robots'
-    patches in this case, over the sizes in the cell."""
+    """Build the function from a case (18,) of the uncertainty to the patch sizes (2,) of both
+    robots: the patch radius in this case over the radius that the cell states."""
     case = ca.SX.sym("case", CASE_SIZE)
     radius = case_parts(case)[1]
     own = [ca.SX(number(contact.patch_radius)) for contact in squeeze.workcell.contacts]
