@@ -37,7 +37,8 @@ def _add_options(parser: Parser) -> None:
 
 
 def show(options: argparse.Namespace) -> int:
-    """Print a first result, then make the rack's quick study. Return the exit code.
+    """Print a first result, then run the example cell `rack` as a quick study. Return the exit
+    code.
 
     The study's page is opened in a browser if the options request it.
     """
@@ -59,8 +60,8 @@ def show(options: argparse.Namespace) -> int:
 
 
 def first_result(evaluations: int = QUICK_EVALUATIONS, seed: int = 1) -> Iterator[str]:
-    """Yield texts to print: the limits that hold back the rack's hand-made carry, then the first
-    front of a short search.
+    """Yield two texts to print on the example cell `rack`: the duration of its hand-made path and
+    the limits that the path uses fully, then a table of carries found by a short search and polish.
 
     Args:
         evaluations: number of candidates of the search.

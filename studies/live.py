@@ -29,8 +29,8 @@ def _add_options(parser: Parser) -> None:
 def serve(options: argparse.Namespace) -> int:
     """Serve a page on which a cell can be changed, until Ctrl-C. Return the exit code.
 
-    The first carry shown is the hand-made path, with a force limit that keeps its commanded forces
-    within the reference forces if there is one.
+    The page first shows the hand-made path. Its force limit is chosen such that the commanded
+    forces stay within the reference forces, if any force limit does that.
 
     Raises:
         DualArmError: the cell has no drivable form, or the package viser is not installed.

@@ -179,8 +179,9 @@ def _require_any(path: Path) -> None:
 
 
 def _require_recording(path: Path) -> None:
-    """Check that a recording has files. A recording with a file per arm may consist of RUN.toml
-    only."""
+    """Check that a recording exists: its settings RUN.toml, or the file itself. A recording with
+    one file per arm has RUN.toml only.
+    """
     if not path.with_suffix(".toml").exists():
         _require_any(path)
 
@@ -363,14 +364,14 @@ def add_looks(parser: argparse.ArgumentParser) -> None:
 
 
 def stated(name: str) -> Any:
-    """Read a constant or a default value from the source of a module, without importing the module.
+    """Read a constant, or the default of a field, from the source of a module without importing it.
 
     Args:
-        name: name of a constant or of a field of settings, with module and class, such as
-            'hybrid_opt.campaign.settings.CampaignSettings.seed'.
+        name: name of the constant, or of the field of a settings class, with module and class, such
+            as 'hybrid_opt.campaign.settings.CampaignSettings.seed'.
 
     Returns:
-        The value; the allowed values of a `Literal`; the keys of a table.
+        The value. For a `Literal` the tuple of its values; for a dictionary the tuple of its keys.
 
     Raises:
         LookupError: the source does not state this value.

@@ -41,8 +41,9 @@ def _add_options(parser: Parser) -> None:
 
 
 def _uncertainty(text: str) -> float | dict[str, float]:
-    """Parse a factor on all ranges of the uncertainty, or ranges by their names in a workcell file
-    from 'NAME=VALUE,NAME=VALUE'."""
+    """Parse the uncertainty from text: either one factor on all its ranges, such as '1.5', or
+    single ranges as 'NAME=VALUE,NAME=VALUE', named as in a workcell file.
+    """
     if "=" not in text:
         return number(0.0, 20.0)(text)
     read, found = number(0.0, 1e7), {}

@@ -76,13 +76,13 @@ def write_bundle(
 
 
 def read_manifest(folder: Path) -> dict[str, Any]:
-    """Read the manifest of a bundle.
+    """Read the manifest of a bundle and check its checksum.
 
     Args:
         folder: folder of the bundle.
 
     Returns:
-        JSON values by name.
+        Entries of the manifest by name, as JSON values, without the checksum.
 
     Raises:
         ResultsError: the manifest is missing, damaged, or was changed after writing.
@@ -98,10 +98,11 @@ def read_manifest(folder: Path) -> dict[str, Any]:
 
 
 def _require_own(folder: Path) -> None:
-    """Check that a folder to be replaced holds only a bundle, unchanged since it was written.
+    """Check that a folder can be replaced by a bundle: it is missing, empty, or holds only a bundle
+    whose files are unchanged since they were written.
 
     Raises:
-        ResultsError: the folder holds another file; the message names the first one.
+        ResultsError: the folder holds another or a changed file; the message names the first one.
     """
     if not os.path.lexists(folder):
         return

@@ -44,7 +44,7 @@ _FULL = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 
 @contextmanager
 def storing(path: Path, remedy: str = RESUME) -> Iterator[None]:
-    """Convert errors of file operations in the `with` block to a `ResultsError`.
+    """Convert operating system errors in the `with` block to a `ResultsError`.
 
     Args:
         path: path of the file or folder, for the error message.
@@ -82,7 +82,7 @@ def write_atomically(path: Path, content: bytes, remedy: str = RESUME) -> None:
 
 
 def write_json(path: Path, document: Any) -> None:
-    """Write JSON values to a file in one step.
+    """Replace the content of a file by JSON values, in one step as by `write_atomically`.
 
     Args:
         path: path of the file.
@@ -259,8 +259,8 @@ def sha256(content: bytes) -> str:
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """Lock a results folder for this process within a `with` block; the end of the process also
-    releases it.
+    """Lock a results folder against other processes during the `with` block. If this process dies,
+    the lock ends with it.
 
     Args:
         folder: the results folder.

@@ -75,13 +75,16 @@ class StoredTrajectory:
 
     @property
     def objectives(self) -> tuple[str, ...]:
-        """Names of the stored objectives, or the paper's objectives if none is known."""
+        """Names of the objectives among the stored figures; the paper's objectives if there are
+        none.
+        """
         named = {f"{OBJECTIVE}{name}": name for name in OBJECTIVES}
         found = tuple(named[figure] for figure in self.figures if figure in named)
         return found or PAPER_OBJECTIVES
 
     def open_cell(self, folder: Path) -> Cell:
-        """Write the workcell's files to a folder, and return the cell with the stored objectives.
+        """Write the stored workcell's files to a folder, and return a cell with this workcell and
+        the stored objectives.
 
         Args:
             folder: folder for the files.
@@ -92,13 +95,14 @@ class StoredTrajectory:
         return Cell(self.unpack(folder), self.objectives)
 
     def unpack(self, folder: Path) -> Workcell:
-        """Write the workcell's files to a folder, and return the workcell read from them.
+        """Write the stored workcell's files to a folder, and return the workcell read from them.
 
         Args:
             folder: folder for the files.
 
         Raises:
-            ResultsError: the stored workcell is not valid, or does not fit the decision vector.
+            ResultsError: the stored workcell is not valid, or does not fit the decision vector or
+                the start postures.
         """
         workcell = unpack_cell(self.cell, folder)
         if self.x.shape != (workcell.task.n_var,):
@@ -163,10 +167,11 @@ def write_trajectory(
 
 
 def _standing_still(workcell: Workcell) -> tuple[Array, ...]:
-    """Return the arguments of the candidate function that follow the decision vector x.
+    """Return the arguments that the candidate function takes after the decision vector x.
 
-    For drivable cells they are times (n,) [s], path speeds (n,) and path accelerations (n,) of a
-    carry at rest, because the start postures do not depend on the timing. Other cells have none.
+    For drivable cells these are times (n,) [s], path speeds (n,) and path accelerations (n,).
+    Speeds and accelerations are zero here, because start postures do not depend on the timing. For
+    other cells the tuple is empty.
 
     Args:
         workcell: the cell.
@@ -210,11 +215,11 @@ class _Content:
     cell: Any
 
     def __post_init__(self) -> None:
-        """Check sizes and names.
+        """Check numbers and names of the file.
 
         Raises:
-            ValueError: there are more or larger numbers than any cell has, or a name is not
-                printable.
+            ValueError: a list has more than `MOST_NUMBERS` numbers, a number exceeds the largest
+                that any cell can have, or the name of a figure is not printable.
         """
         vectors = {"decision": self.decision, "start[0]": self.start[0], "start[1]": self.start[1]}
         for name, values in (vectors | {"figures": tuple(self.figures.values())}).items():
@@ -281,11 +286,15 @@ class Replay:
 
 
 def replay(stored: StoredTrajectory, cell: Cell) -> Replay:
-    """Evaluate a stored trajectory again and compare all stored figures.
+    """Evaluate a stored trajectory again and compare the results with the stored ones.
 
     Args:
         stored: the stored trajectory.
         cell: the cell from `StoredTrajectory.open_cell`.
+
+    Returns:
+        Stored and recomputed value of every figure, and the largest difference of a joint position
+        at the first sample.
 
     Raises:
         DualArmError: the model of the cell cannot be built.

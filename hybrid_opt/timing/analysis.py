@@ -76,15 +76,17 @@ class ForceCurve:
 
 
 def check_search_timing(model: TimingModel, x: Array) -> Timing:
-    """Check the search's timing of a decision vector against all limits of the workcell.
+    """Check a decision vector, with the timing under which searches evaluate it, against all limits
+    of the workcell.
 
     Args:
         model: timing model of the workcell.
         x: (n_var,) decision vector.
 
     Returns:
-        Timing with the utilisation of every limit. Its status is `OK`; `EXCEEDED` if a limit is
-        exceeded or if the carry does not start and end at rest; or the error of the path itself.
+        Timing with the utilisation of every limit. Its status is `OK`; or `EXCEEDED` if a limit is
+        exceeded or the carry does not start and end at rest; or the status of the error if the path
+        has no timing at all.
 
     Raises:
         SettingsError: x does not fit the workcell.
@@ -105,8 +107,8 @@ def check_search_timing(model: TimingModel, x: Array) -> Timing:
 
 
 def _jump(model: TimingModel, carry: Carry) -> Place | None:
-    """Find the joint with the largest speed at the start or the end of a carry, relative to its
-    speed limit. There its speed would have to jump.
+    """Find the joint that moves at the start or the end of a carry, so that its speed would have to
+    jump there. Of several joints it is the one with the largest speed relative to its limit.
 
     Args:
         model: timing model of the workcell.
@@ -127,11 +129,12 @@ def _jump(model: TimingModel, carry: Carry) -> Place | None:
 
 
 def drivable_timing(model: TimingModel, x: Array) -> Timing:
-    """Compute the fastest timing of a path within the force limit that its decision vector states.
+    """Compute the fastest timing of a path within the force limit, which is the last entry of its
+    decision vector.
 
-    Searches check the limits of a timing at its grid points. If the search's timing of this path
-    satisfies them between these points as well, it is returned; otherwise `time_path` computes a
-    new one.
+    A search computes such a timing too, but checks the limits at its grid points only. That timing
+    is returned if it satisfies the limits on this model's finer grid as well; otherwise `time_path`
+    computes a new one.
 
     Args:
         model: timing model of the workcell.
@@ -252,9 +255,9 @@ def time_trajectory(
     """Compute the timings of one trajectory that a report compares.
 
     They are, by name in the result: 'search', the timing under which the search found x; 'closest
-    to reference', the fastest one within the task's reference speeds; 'fastest'; with `force_limit`
-    also 'force limited'. A drivable carry in a workcell with jerk limits also has 'within jerk
-    limits'.
+    to reference', the fastest one within the task's reference speeds; 'fastest', without these
+    speeds and without force limit; with `force_limit` also 'force limited'. A drivable carry in a
+    workcell with jerk limits also has 'within jerk limits'.
 
     Args:
         model: timing model of the workcell, usually with the drivable time law.
@@ -265,8 +268,9 @@ def time_trajectory(
             curve.
         own: timing model of the workcell in which the search found x, if that has another time law;
             None if it is `model`.
-        progress: True for a progress bar, or a function of the finished and the total number of
-            timings. The margins count as one timing.
+        progress: True for a progress bar, False for none; or a function that is called with the
+            number of finished and of all steps. Each timing is a step, and so are the validation by
+            TOPP-RA and the robustness margins.
 
     Raises:
         SettingsError: x does not fit the workcell, or the limit is not a positive force.

@@ -93,8 +93,8 @@ LEAST_COEFFICIENT_SHARE = 0.05
 
 
 def driven_timing(model: TimingModel, x: Array) -> Timing:
-    """Compute the timing with which robots drive a carry: the fastest one within `driven_limits`
-    and the workcell's limits, without jumps of acceleration.
+    """Compute the timing with which robots drive a carry: the fastest one within the workcell's
+    limits and `driven_limits`, with continuous acceleration.
 
     If the path has no timing, the result states why.
 
@@ -103,8 +103,8 @@ def driven_timing(model: TimingModel, x: Array) -> Timing:
         x: (n_var,) decision vector of the carry.
 
     Raises:
-        JobError: the smoothed timing exceeds its limits even at half speed, or the limits on jerk
-            cannot be satisfied.
+        JobError: there is no such timing: the smoothed one exceeds a limit even at half its speed,
+            or the limits on jerk cannot be satisfied.
     """
     limits = driven_limits(model, x)
     timing = time_path(model, x, limits)
@@ -133,20 +133,21 @@ def driven_limits(model: TimingModel, x: Array) -> TimingLimits:
 def without_jumps(
     model: TimingModel, timing: Timing, jerk: JerkLimits | None, width: float = SMOOTHING_WIDTH
 ) -> Timing:
-    """Compute a timing of the same path without jumps of the acceleration, within the limits of the
-    given timing. Jobs need such a timing.
+    """Compute a timing of the same path with continuous acceleration, within the limits of the
+    given timing.
 
-    A timing that begins and ends without acceleration is returned unchanged.
+    With limits on jerk it is a new, fast timing. Without, the given timing is smoothed over a
+    window of time and slowed down. If all joint accelerations of the given timing are zero at both
+    ends, it is returned unchanged.
 
     Args:
         model: timing model of the workcell.
         timing: drivable timing with path speeds on the grid.
-        jerk: limits on jerk for a new timing of the path; None to smooth the given timing instead.
-        width: half the width of the window over which the timing is averaged [s]; zero returns the
-            given timing.
+        jerk: limits on jerk; None to smooth the given timing.
+        width: half the width of the smoothing window [s]; zero returns the given timing.
 
     Raises:
-        JobError: the smoothed timing exceeds its limits even at half speed, or the limits on jerk
+        JobError: the smoothed timing exceeds a limit even at half its speed, or the limits on jerk
             cannot be satisfied.
     """
     if width == 0.0 or has_rest_at_ends(timing):
@@ -160,8 +161,8 @@ def without_jumps(
 
 
 def has_rest_at_ends(timing: Timing) -> bool:
-    """Return True if all joint accelerations of a timing are zero at beginning and end, up to a
-    tolerance.
+    """Return True if all joint accelerations of a timing are zero at beginning and end, up to the
+    share `RESTS` of their limits.
     """
     return acceleration_at_ends(timing) <= RESTS
 
@@ -360,8 +361,10 @@ class _JerkProblem:
 
     def _start_factor(self, c: Array) -> float:
         """Return a factor on spline coefficients c (k,) of the squared speed that makes the motion
-        slow: no limit is used more than halfway between the largest use at rest and the whole
-        limit.
+        slow enough for a first iterate.
+
+        With r the largest ratio of a quantity to its limit at rest, all ratios of the slowed motion
+        are at most r + `START_UTILISATION` (1 - r).
         """
         factor = 1.0
         rest = max(self._check(self._coarse, 0.0 * c)[1:])
@@ -388,11 +391,11 @@ class _JerkProblem:
         return timing, most_used(timing.use).ratio, joint, box
 
     def _use_by_factor(self, c: Array) -> Callable[[float], float]:
-        """Return a function that tells how far a slowed motion uses its limits: from a factor on
-        all speeds to the largest ratio of value to limit at the finer points.
+        """Return a function that maps a factor on all speeds to the largest ratio of a quantity to
+        its limit at the finer points.
 
         Args:
-            c: (k,) spline coefficients of the squared speed of the motion that is slowed.
+            c: (k,) spline coefficients of the squared speed at factor 1.
         """
         jerk = max(float(jerk.max()) for jerk in self._jerks(self._fine, c))
 
@@ -523,7 +526,8 @@ class WarpedPath:
 
         Returns:
             Times [s] of the samples, path speeds u' [1/s] and path accelerations u'' [1/s^2], (n,)
-            each. The times are s itself if all coefficients are zero (rest).
+            each. For rest (all coefficients zero) the path parameter s takes the place of the
+            times.
         """
         v, time = self.value @ c, self.s
         if v.any():

@@ -171,16 +171,17 @@ class CarryLimits:
         return not limit.option or bool(getattr(limits, limit.option))
 
     def ratios(self, carry: Carry, limits: TimingLimits) -> dict[str, Array]:
-        """Compute every limited quantity over its limit at n samples of a carry.
+        """Compute every limited quantity, divided by its limit, at n samples of a carry.
 
         Args:
             carry: the carry.
             limits: limits in addition to the workcell's.
 
         Returns:
-            Ratios by name: the friction, and each limit of `symbolic.limits.LIMITS` that applies.
-            The shape is (n, joints of both arms) for a limit on joints, (n, 2) for a limit on
-            robots, and (n, 1) or (n,) for a limit on the payload.
+            Ratios by name. `FRICTION_RATIO` is the tangential force over the largest one that
+            friction bears; the others are the limits of `symbolic.limits.LIMITS` that apply. The
+            shape is (n, joints of both arms) for a limit on joints, (n, 2) for a limit on robots,
+            and (n, 1) or (n,) for a limit on the payload.
         """
         bound = np.maximum(carry.normal_force * self._friction, LEAST_NORMAL_FORCE)
         ratios = {FRICTION_RATIO: carry.tangential_force / bound}
@@ -219,8 +220,9 @@ class CarryLimits:
         return np.maximum(carry.normal_force, np.stack([leading, commanded], axis=1))
 
     def _near_limit(self, carry: Carry, limits: TimingLimits) -> Array:
-        """Compute `limited_force` (n, 2) [N] in less time, exactly only where it is near the force
-        limit or near its largest value. Elsewhere the result is the planned force.
+        """Compute `limited_force` (n, 2) [N] at less cost. Robust forces are computed only near the
+        force limit and near the largest force; elsewhere the result is the planned force, a lower
+        bound.
         """
         if not limits.robust or limits.force is None:
             return self.limited_force(carry, limits)
@@ -303,7 +305,8 @@ class TimingModel:
         Args:
             cell: the workcell; give a compiled one to share its functions.
             intervals: number of intervals of constant path acceleration.
-            robust: whether force limits apply to every case of the workcell's uncertainty.
+            robust: True if force limits apply to robust forces, which hold in every case of the
+                workcell's uncertainty; False for planned forces.
 
         Raises:
             SettingsError: the number of intervals is out of range.

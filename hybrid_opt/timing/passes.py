@@ -476,14 +476,13 @@ def failed_timing(status: TimingStatus, place: Place, intervals: int) -> PathTim
 def path_failure(
     workcell: Workcell, pose: Array, lost: Array, limit_margin: Array, manipulability: Array
 ) -> tuple[TimingStatus, Place, str] | None:
-    """Find out why a path has no timing at any speed: nothing moves, or an arm does not reach a
-    pose, leaves its joint range or is near a singularity.
+    """Find out why a path has no timing at any speed: all its poses are the same, or an arm does
+    not reach a pose, leaves its joint range or is near a singularity.
 
     Args:
         workcell: the workcell.
         pose: (n, 6) box poses at uniform samples of the path parameter.
-        lost: (n, 2) by sample and arm, 0 while the arm has reached all samples up to this one, else
-            1.
+        lost: (n, 2) 0 at samples up to which the arm has reached every pose, else 1.
         limit_margin: (n, 2) least distance of a joint to its limits [rad], negative beyond them.
         manipulability: (n, 2) absolute determinant of the Jacobian [m^3].
 

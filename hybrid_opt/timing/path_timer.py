@@ -253,12 +253,13 @@ class CandidateDriver:
     """
 
     def __init__(self, timer: PathTimer, threads: int = 1, robust: bool = False) -> None:
-        """Store a path timer.
+        """Prepare the timing of candidates, each within the force limit in its decision vector.
 
         Args:
             timer: computes the timings.
             threads: number of threads that share a batch of candidates.
-            robust: whether force limits apply to every case of the workcell's uncertainty.
+            robust: True if force limits apply to robust forces, which hold in every case of the
+                workcell's uncertainty; False for planned forces.
         """
         self._task = timer.workcell.task
         self._threads = threads
@@ -268,10 +269,11 @@ class CandidateDriver:
         self._last: tuple[bytes, TimedCandidate] | None = None
 
     def limits(self, force: float) -> TimingLimits:
-        """Return the timing limits of a candidate with a force limit.
+        """Return the limits within which a candidate is timed.
 
         Args:
-            force: the force limit [N].
+            force: force limit of the candidate [N]; values below `LEAST_FORCE_LIMIT` are raised to
+                it.
         """
         return TimingLimits(force=max(force, LEAST_FORCE_LIMIT), robust=self.robust)
 
@@ -304,11 +306,11 @@ class CandidateDriver:
                 one second.
 
         Returns:
-            Outputs of `candidate` by name, and `peak_force` (n, 2), the largest normal forces [N];
-            `drive_violation` (n, len(DRIVE_CONSTRAINTS)), positive where there is no timing;
-            `drive_position` (n,), the path parameter of a violation, NaN if there is none. With
-            robust limits also `robust_force` (n, 2), the largest normal forces over all cases of
-            the workcell's uncertainty [N].
+            Outputs of `candidate` by name, and three more. `peak_force` (n, 2): largest normal
+            forces [N]. `drive_violation` (n, len(DRIVE_CONSTRAINTS)): positive for the constraint
+            that rules out a timing, else zero. `drive_position` (n,): path parameter u of the
+            violation, NaN without one. With robust limits also `robust_force` (n, 2): largest
+            normal forces over all cases of the workcell's uncertainty [N].
         """
         if len(x) == 1:
             timings = [self.time_candidate(x[0]).timing]

@@ -85,17 +85,17 @@ class PathLimits:
         return getattr(m, f"{name}_first"), getattr(m, f"{name}_second")
 
     def forces(self, a: Array, w: Array) -> list[tuple[Array, Array]]:
-        """Compute the normal forces over the force limit, as far as they are convex functions of
-        (u'', u'^2).
+        """Compute the ratios of normal forces to the force limit, for those forces that are convex
+        functions of (u'', u'^2).
 
         Args:
             a: (n,) path accelerations u'' [1/s^2].
             w: (n,) squared path speeds u'^2 [1/s^2].
 
         Returns:
-            One pair for planned forces, and one for robust forces if these are limited: values (n,
-            2) of both robots, and their derivatives (n, 2, 2) by (u'', u'^2). An empty list without
-            force limit.
+            A list of pairs: ratios (n, 2) of both robots, and their derivatives (n, 2, 2) by (u'',
+            u'^2). The first pair is for planned forces. A second one, for robust forces, is added
+            if these are limited and convex. The list is empty without force limit.
         """
         model, limit = self._model, self._limits.force
         if limit is None:
@@ -107,14 +107,14 @@ class PathLimits:
         return [(force / limit, slope / limit) for force, slope in found]
 
     def ratios(self, a: Array, w: Array) -> Array:
-        """Compute, over their limits, the limited quantities that are not convex in (u'', u'^2).
+        """Compute the ratios to their limits of those quantities that are not convex in (u'',
+        u'^2).
 
         The columns are, in this order and as far as limited:
 
         - joint torques, with sign;
         - pressure shifts of both pads;
-        - robust forces of both robots. They are left out if the normal force of one pad determines
-          that of the other pad, because `forces` has them then.
+        - robust forces of both robots, unless `forces` returns them as convex functions.
 
         Args:
             a: (n,) path accelerations u'' [1/s^2].
@@ -302,13 +302,13 @@ class JerkProgram:
         """Minimise c^T H c / 2 + g . c over spline coefficients c (k,), subject to all rows and
         cones.
 
-        The program is solved with few rows, and again with the violated rows added, until no row is
-        violated.
+        The first program has only the constraints that are nearly active at `about`. Violated
+        constraints are added and the program is solved again, until none is violated.
 
         Args:
             H: (k, k) matrix of the objective.
             g: (k,) vector of the objective.
-            about: (k,) coefficients near the solution; rows that they nearly use enter at once.
+            about: (k,) coefficients near the solution.
 
         Returns:
             Coefficients (k,); None if the solver fails.

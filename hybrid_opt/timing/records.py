@@ -173,7 +173,7 @@ class Timing(Displayable):
 
     @property
     def driven(self) -> Carry:
-        """The carry under this timing; only for a timing that has one."""
+        """The carry under this timing. Use it only if `carry` is not None."""
         assert self.carry is not None, self.reason
         return self.carry
 

@@ -277,7 +277,7 @@ class TimingSensitivity:
     """
 
     def __init__(self, model: TimingModel, timing: Timing) -> None:
-        """Linearise the limits that a timing nearly uses.
+        """Linearise the limits that a timing uses almost fully.
 
         Args:
             model: timing model of the workcell, with as many intervals as the timing.
@@ -323,14 +323,14 @@ class TimingSensitivity:
             )
 
     def changes(self, low: dict[str, Array], high: dict[str, Array]) -> tuple[float, float]:
-        """Compute how the shortest duration changes with a number of the workcell file, to first
-        order.
+        """Compute to first order how the shortest duration changes if one number of the workcell
+        file is raised or lowered by a small step.
 
         Args:
-            low: ratios of all limited quantities to their limits (`CarryLimits.ratios`) for the
-                path with the speeds of the fastest timing (attribute `speeds`), with the number
-                lowered.
-            high: the same ratios with the number raised by the same amount.
+            low: ratios of all limited quantities to their limits (`CarryLimits.ratios`) with the
+                number lowered by the step. Path and speeds (attribute `speeds`) are those of the
+                fastest timing.
+            high: the same ratios with the number raised by the step.
 
         Returns:
             Change of the duration [s] with the number raised, and with it lowered; NaN if no timing

@@ -55,7 +55,7 @@ def smoothed(model: TimingModel, timing: Timing, width: float) -> Timing:
         width: half the width of the window [s].
 
     Raises:
-        JobError: the smoothed timing exceeds its limits even at half speed.
+        JobError: the smoothed timing exceeds its limits even at half its speed.
     """
     u, rate, second = _averaged(timing.grid_speed, width)
     motion = model.path_motion(timing.driven.x).interpolate(u)

@@ -271,10 +271,9 @@ def largest_speed_factor(use: Callable[[float], float]) -> float:
 
 
 def most_used(use: dict[str, Utilisation]) -> Utilisation:
-    """Return the largest of the utilisations.
+    """Return the limit with the largest ratio of value to limit.
 
-    The utilisation of friction is one by construction of the forces, so it counts only if friction
-    is exceeded.
+    Friction counts only if it is exceeded: the least forces use all of it by construction.
 
     Args:
         use: largest utilisation by name of the limit.

@@ -135,8 +135,13 @@ class _CuttingPlaneProblem:
             yield tangent_rows(*force, _pairs(still, still))
 
     def solve(self) -> PathTiming | Timing:
-        """Solve linear programs until the recomputed limits are satisfied and the duration
-        settles."""
+        """Solve linear programs until the timing satisfies all limits and its duration no longer
+        changes.
+
+        Returns:
+            The timing, with status `NOT_CONVERGED` after `MAX_ITERATIONS` programs; or the failure
+            of the solver.
+        """
         squared = np.zeros(0)
         settled = False
         for iteration in range(1, MAX_ITERATIONS + 1):
@@ -324,9 +329,9 @@ def linearised_rows(value: Array, gradient: Array, at_rest: Array, z: Array) -> 
     """Linearise k functions of (u'', u'^2), which may not exceed one, about points z, such that
     rest (u'' = u'^2 = 0) stays feasible.
 
-    A tangent that forbids rest is replaced by an affine function. This has the function's values at
-    z and at rest, and the tangent's slope by u''. A larger bound of the tangent would not exclude
-    z, although z exceeds the limit.
+    Where the tangent at z would forbid rest, an affine function replaces it: it has the function's
+    values at z and at rest, and the tangent's slope by u''. To shift the tangent until it allows
+    rest would not do, because it might then allow z, which exceeds the limit.
 
     Args:
         value: (n, k) values of the functions at z.

@@ -81,7 +81,8 @@ class CampaignComparison:
 
 
 def compare(first: Path, second: Path) -> CampaignComparison:
-    """Compare the finished campaigns in two results folders, figure by figure.
+    """Compare the finished campaigns in two results folders: settings, and every figure (indicator,
+    duration and the like) of the algorithms that they share.
 
     Args:
         first, second: the folders.
@@ -142,13 +143,15 @@ def _values(
 ) -> dict[str, list[float]]:
     """Return the figures of one algorithm by name, each as a list with one value per replica.
 
-    Figures of polished fronts come last; their names have a prefix.
+    Some figures are stored in the summary. Those of `RECOMPUTED_FIGURES` depend on the reference
+    front and are computed anew. Figures of polished fronts come last, with the prefix
+    `POLISHED_PREFIX` in their names.
 
     Args:
         run: results of the campaign.
         name: name of the algorithm.
         summary: stored summary of the campaign.
-        reference: points (k, n_obj) of the reference front, by which indicators are computed anew.
+        reference: points (k, n_obj) of the reference front of both campaigns.
     """
     stored = summary.algorithms[name].replicas
     better = [row.polished for row in stored if row.polished is not None]
@@ -222,7 +225,7 @@ def as_text(found: CampaignComparison) -> str:
 
 
 def _quantity(figure: str) -> tuple[str, Quantity]:
-    """Return the name of a figure as people read it, and the quantity that formats its values."""
+    """Return the heading of a figure in tables, and the quantity that formats its values."""
     quantity = REPLICA_QUANTITIES[figure.removeprefix(POLISHED_PREFIX)]
     of = "polished, " if figure.startswith(POLISHED_PREFIX) else ""
     return f"{of}{quantity.heading()}", quantity

@@ -248,14 +248,15 @@ def _pairs(cell: Cell, listed: bool) -> ProgramResult:
 
 
 def _optimum(cell: Cell, progress: Progress) -> Optimum:
-    """Polish the hand-made trajectory of a cell briefly, to find which bounds hold it back.
+    """Polish the hand-made trajectory of a cell briefly, to find the bounds of decision variables
+    that are active at the optimum.
 
     Args:
         cell: the cell.
         progress: receives messages on the progress.
 
     Returns:
-        The result of the polish, and the bounds on which its solutions lie.
+        The result of the polish, and the active bounds.
     """
     verdicts = cell.evaluate(cell.initial)
     if not verdicts.feasible.all():

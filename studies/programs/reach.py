@@ -48,11 +48,12 @@ def reached(
     output: Path | None = None,
     progress: Progress | None = None,
 ) -> Iterator[ProgramResult]:
-    """Yield a map of the box poses that both arms can hold at once, the best pose, and the picture.
-    If there is no such pose, yield the reasons and the least changes of the cell that allow one.
+    """Yield the findings on where both arms can hold the box: a map of box poses, the best pose,
+    and the picture. If no pose can be held, yield instead of the best pose what prevents it, and
+    the least changes of the cell that allow one.
 
     Args:
-        problem: the problem, with bases.
+        problem: the problem, with the bases of both robots.
         settings: grid of the map.
         seed: seed of the random postures.
         output: folder for the picture; None to draw none.

@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 
 
 def regenerate(options: argparse.Namespace) -> int:
-    """Generate, compile and check functions as the options state. Return the exit code."""
+    """Generate the code of a cell's functions, compile it, and check it against the interpreted
+    expressions, as far as the options request. Return the exit code.
+    """
     cache, found = Cache(), list[Agreement]()
     print_findings(_regenerated(cache, options, found), options.json)
     return 0 if all(comparison.agrees for comparison in found) else FAULT
@@ -32,14 +34,15 @@ def regenerate(options: argparse.Namespace) -> int:
 def _regenerated(
     cache: Cache, options: argparse.Namespace, found: list[Agreement]
 ) -> Iterator[ProgramResult]:
-    """Do what the options request, and yield one result per action.
+    """Clean the cache, compile the functions of a workcell or of a whole study, and report the
+    cache's size, as far as the options request. Yield one result per action.
 
     The workcell is read and its expressions are made before `--clean` removes anything.
 
     Args:
         cache: cache of compiled functions.
         options: parsed command line.
-        found: list to which comparisons of functions are added.
+        found: list to which comparisons of compiled with interpreted functions are added.
     """
     largest = largest_size()
     cell = (

@@ -82,8 +82,9 @@ def simulate_arms(
 ) -> str:
     """Simulate a carry with both arms, print the results, and return the simulated cell as MJCF.
 
-    The results are the least factor of the planned forces that holds the box, the job with the
-    commanded forces, and random cases of the uncertainty.
+    The results are: the least factor on the planned forces with which the box holds; the job with
+    the commanded forces; and random cases of the uncertainty. With `--sweep` the factor is also
+    found for a shorter and a longer time step.
 
     Args:
         cell: the cell.
@@ -92,8 +93,7 @@ def simulate_arms(
         options: parsed command line.
 
     Raises:
-        SimulationError: with --sweep, the box holds at the lower factor or slips at the upper
-            factor.
+        SimulationError: with `--sweep`, the factor is not within the searched range.
     """
     control, leader, workcell = options.controller, options.leader - 1, cell.workcell
     witness = CellSimulation(workcell, settings)
@@ -288,8 +288,9 @@ def simulate_hands(
 
 
 def _swept(step: float) -> tuple[float, float]:
-    """Return the time steps to compare with a time step [s]: half and twice as long, at most
-    `LARGEST_TIME_STEP`."""
+    """Return the two time steps of `--sweep` [s]: half of `step`, and twice `step` but at most
+    `LARGEST_TIME_STEP`.
+    """
     return step / 2.0, min(2.0 * step, LARGEST_TIME_STEP)
 
 
@@ -300,8 +301,8 @@ def _tell_sweep(step: float, threshold: Threshold[AnyOutcome]) -> None:
 def _tell_worst(
     pressed: Callable[[float], Outcome], planned: Callable[[], Outcome], workcell: Workcell
 ) -> None:
-    """Print whether the box is held with the worst friction of the uncertainty, with the commanded
-    and with the planned forces.
+    """Print whether the box holds with the least friction coefficients of the uncertainty: under
+    the commanded forces with the largest tracking error, and under the planned forces.
 
     Args:
         pressed: function that simulates the carry with the commanded forces times its argument.

@@ -112,8 +112,8 @@ def stages(study: StudySettings, alone: bool = False) -> tuple[Stage, ...]:
 
     Args:
         study: choice of the stages and their settings.
-        alone: True if the study's first experiment is drivable itself, so that there is no second
-            one.
+        alone: True if the first experiment already searches for drivable carries, so that the study
+            has no second, drivable experiment.
     """
     every = [search_stage()]
     if study.polish is not None:
@@ -152,8 +152,8 @@ def report_stage(study: StudySettings) -> Stage:
 
 
 def _paths_beside(folder: CampaignFolder) -> Array:
-    """Return good paths (m, n_path) of a study's first experiment, with which the search of the
-    drivable experiment starts.
+    """Return the paths (m, n_path) with which the polish of a study's drivable experiment starts:
+    paths of the fronts of the first experiment.
 
     Args:
         folder: folder of the drivable experiment, inside that of the study.
@@ -168,7 +168,7 @@ def run_study(
     progress: Progress,
     study: StudySettings,
 ) -> str:
-    """Run all stages of a study that are not done yet. Return its figures as text.
+    """Run all stages of a study that are not done yet. Return its results as text for a terminal.
 
     Args:
         workcell: the cell; it is read again from its file.
@@ -213,7 +213,7 @@ def run_study(
 
 
 def study_text(root: Path, with_paper: bool, brief: bool = False) -> str:
-    """Format the figures of a finished study for a terminal, with the recommended carry first.
+    """Format the results of a finished study for a terminal: the recommended carry, then tables.
 
     Args:
         root: results folder of the study.

@@ -232,8 +232,9 @@ def _report(job: Job, stiffness: float | None) -> str:
 
 
 def check_file(options: argparse.Namespace) -> int:
-    """Check whether a file of joint positions carries the box in a cell, and print the result.
-    Return the exit code."""
+    """Check a file of joint positions: whether both arms hold the box along it, within all limits
+    of the cell. Print the result and return the exit code.
+    """
     workcell = load_workcell(options.workcell)
     cell = Cell(workcell, compiled=InterpretedCell(workcell))
     trajectory = joint_trajectory(options.trajectory, cell.workcell)
@@ -279,10 +280,11 @@ def _robust_forces(cell: Cell, x: Array, options: argparse.Namespace) -> int:
 
 
 def _priced(model: RobustModel, carry: Carry, options: argparse.Namespace) -> int:
-    """Print how much a carry's normal forces grow with the uncertainty. Return the exit code.
+    """Print how much a carry's normal forces grow with the size of the uncertainty. Return the exit
+    code.
 
-    The forces are computed for several multiples of the uncertainty, and tested in random cases of
-    the uncertainty.
+    The forces are computed for several factors on all ranges of the uncertainty. The forces at
+    factor 1 are tested in random cases of the uncertainty.
 
     Args:
         model: model that computes robust forces.

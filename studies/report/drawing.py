@@ -192,11 +192,11 @@ def limit_line(axes: Axes, level: float, label: str, across: bool = True) -> Non
 
 
 def rest_line(axes: Axes, level: float, label: str) -> None:
-    """Draw a normal force of the payload at rest as a horizontal line.
+    """Draw the normal force that holds the payload at rest as a horizontal line.
 
     Args:
         axes: the panel.
-        level: the force on the vertical axis, in the unit of this axis.
+        level: the force, in the unit of the vertical axis.
         label: name in the legend.
     """
     axes.axhline(level, color="black", linewidth=0.8, linestyle=(0, (7, 2, 1, 2)), label=label)
@@ -209,8 +209,8 @@ def panel_label(axes: Axes, letter: str, text: str, bare: bool = False) -> None:
         axes: the panel.
         letter: the letter.
         text: the text.
-        bare: True if nothing else stands above the panel. It saves Matplotlib a search that takes
-            half the time of a layout.
+        bare: True if nothing else stands above the panel. The label then has a fixed height, and
+            Matplotlib need not search for free room, which takes half the time of a layout.
     """
     axes.set_title(f"({letter}) {text}", loc="left", y=1.0 if bare else None)
 
@@ -274,7 +274,9 @@ class DrawnCarry:
 
     @cached_property
     def sensitivity(self) -> PayloadSensitivity:
-        """Contact forces of the carry's motion for other masses of the payload."""
+        """Contact forces of the carry as a function of the payload mass, with path and timing
+        unchanged.
+        """
         # Not imported at the top: pictures of a cell need no timing.
         from hybrid_opt.timing.robustness import payload_sensitivity
 

@@ -64,7 +64,7 @@ class Film:
 
     @classmethod
     def of(cls, carry: DrawnCarry) -> Film:
-        """Return the film of a carry in its planned timing."""
+        """Return the film of a carry with the timing `carry.timed`."""
         return cls(carry.label, carry.timed.time, carry.timed.pose, carry.timed.q)
 
     @property

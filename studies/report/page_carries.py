@@ -73,11 +73,12 @@ class DrawnJob:
 
 
 def recommended_job(x: Array, cells: Sequence[ReadyCell]) -> DrawnJob:
-    """Plan the job around the recommended carry as robots drive it.
+    """Time the recommended carry as robots drive it, plan the job around it, and compute its
+    robustness margins.
 
     Args:
-        x: (n_var,) decision vector of the carry, in the last cell.
-        cells: cells of the report; robots drive in the last one.
+        x: (n_var,) decision vector of the carry, in the last of the cells.
+        cells: cells of the report; the last one has the drivable time law.
     """
     model = cells[-1].jobs
     found = drawn(model, RECOMMENDED_LABEL, lambda: driven_timing(model.timing, x), True)
@@ -87,15 +88,15 @@ def recommended_job(x: Array, cells: Sequence[ReadyCell]) -> DrawnJob:
 
 
 def drawn_job(label: str, x: Array, limits: TimingLimits, cells: Sequence[ReadyCell]) -> DrawnJob:
-    """Plan the job around a path, with the default forces of an export and within the cell's limits
-    on jerk. This is slow.
+    """Time a path as fast as its limits allow, limits on jerk included, and plan the job around it
+    with the default forces of an export. This is slow.
 
     Args:
         label: name of the trajectory.
         x: (n_var,) decision vector of the path in the first cell.
         limits: limits of the timing in addition to those of the cell.
-        cells: cells of the report; the path belongs to the first one, and robots drive in the last
-            one.
+        cells: cells of the report: the path belongs to the first one; timing and job are computed
+            in the last one, which has the drivable time law.
     """
     model = cells[-1].jobs
     (path,) = resample_decisions(x, cells[0].cell.workcell.task, model.workcell.task)
@@ -130,8 +131,9 @@ def job_samples(job: Job) -> Array:
     largest forces.
 
     The columns are: time [s]; pose of the box (6) [m, rad]; joint positions of both arms [rad or
-    m]; commanded normal force of each arm [N]; least normal force in every case of the uncertainty,
-    and in the nominal case [N], as from `needed_forces`. The last two are NaN while the box stands.
+    m]; commanded normal force of each arm [N]; and the two forces of `needed_forces` [N], in every
+    case of the uncertainty and in the nominal case. The last two are NaN except in the phases
+    `HELD`, in which the arms bear the box.
 
     Returns:
         (k, 11 + joints) samples.
@@ -332,7 +334,7 @@ def page_trajectory(cells: Sequence[ReadyCell], shown: PageTrajectory) -> dict[s
     the limits allow, and shown with planned forces.
 
     Args:
-        cells: cells of the page; the last one is the cell that robots drive.
+        cells: cells of the page; the last one has the drivable time law.
         shown: the trajectory.
     """
     cell, driving = cells[shown.cell].cell, cells[-1]
@@ -395,12 +397,13 @@ def _timed(cell: ho.Cell, driving: ReadyCell, shown: PageTrajectory) -> tuple[Ti
 
     Args:
         cell: the cell of the trajectory.
-        driving: the cell that robots drive.
+        driving: the page's cell with the drivable time law, in which paths of other cells are
+            timed.
         shown: the trajectory.
 
     Returns:
-        The timing and ''; or the failed timing, None without any, and the reason why robots cannot
-        drive the trajectory.
+        The timing and '' on success. Otherwise the failed timing, or None if an error was raised,
+        and the reason why robots cannot drive the trajectory.
     """
     task = driving.cell.workcell.task
     try:
@@ -466,12 +469,13 @@ def joint_torque_use(workcell: Workcell, torque: Array) -> Array:
 def _values(cell: ho.Cell, judged: ho.Carry, found: dict[str, Any]) -> str:
     """Return the figures in the title of a trajectory as text.
 
-    These are duration and commanded force. A carry without a commanded force has duration and
-    planned force if its cell is drivable, otherwise planned forces or objectives.
+    With a commanded force these are duration and commanded force. Without one, a drivable carry has
+    duration and largest planned force; any other carry has both robots' planned forces, or its
+    objectives if these are not the paper's.
 
     Args:
         cell: the cell of the trajectory.
-        judged: the evaluated carry.
+        judged: the carry, with planned forces and objectives.
         found: JSON values of the trajectory with the keys 'duration', 'commanded' and 'planned'.
     """
     if found["commanded"] is not None:

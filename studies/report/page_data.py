@@ -204,12 +204,13 @@ def _finite(points: Array) -> Array:
 
 
 def drive_look(points: Array, always: Array, allowed: float) -> Array:
-    """Select the points of duration and force that a plot shows at first. The long flat ends of
-    fronts are left out, because they would squash the part between them.
+    """Select the points of duration and force that a plot shows at first. Points much slower than
+    the fastest one or far above the reference force are left out, because they would squash the
+    others.
 
     Args:
         points: (n, 2) force [N] and duration [s] of fronts and curves.
-        always: (m, 2) points that must be shown.
+        always: (m, 2) points that are selected in any case.
         allowed: reference force [N].
 
     Returns:
@@ -226,9 +227,10 @@ def drive_look(points: Array, always: Array, allowed: float) -> Array:
 def carry_plots(workcell: Workcell) -> dict[str, Plot]:
     """Return the plotly plots of one trajectory by the ids of their HTML elements, without data.
 
-    The value `meta` of each trace says which data the page's script inserts: a column of the
-    samples, a constant level, or the joint torques of one arm. For a trace of commanded forces it
-    also has the name that the trace takes if the page shows planned forces.
+    The page's script inserts the data. The value `meta` of each trace tells it which: `column`, a
+    column of the samples; `level`, a constant; or `use` and `arm`, the use of torque by one arm's
+    joints. With `column` there is also `planned`, the name of the trace if the page shows planned
+    in place of commanded forces.
     """
     joints, arm = [len(robot.torque_max) for robot in workcell.robots], 1 - LEADER
     force, robot = 7 + sum(joints), plain(workcell.robots[arm].name)

@@ -70,8 +70,9 @@ def normal_forces(data: ReportData) -> Figure:
 
 
 def pressure_shift(data: ReportData) -> Figure:
-    """Shift of the centres of pressure that balances the moments, and the radius of the contact
-    patch (paper Figure 11)."""
+    """Draw the shift of the centres of pressure that balances the moments, and the radius of the
+    contact patch (paper Figure 11).
+    """
 
     def draw(axes: Axes, i: int) -> None:
         for carry in data.drawn:
@@ -182,8 +183,8 @@ def joint_torques(data: ReportData) -> Figure:
 
 
 def _label_rings(axes: Axes, most: Array, top: float) -> None:
-    """Label the rings of a polar plot at round values, between two neighbouring joints with most
-    room.
+    """Label the rings of a polar plot at round values. The labels stand between those two
+    neighbouring joints whose values have the smallest sum.
 
     Args:
         axes: the polar plot, with one direction per joint.
@@ -199,8 +200,9 @@ def _label_rings(axes: Axes, most: Array, top: float) -> None:
 
 
 def residual_moments(data: ReportData) -> Figure:
-    """Draw the moment that is missing with forces at the nominal contact points, and with the
-    centres of pressure shifted."""
+    """Draw the moment that the contact forces leave unbalanced if they act at the nominal contact
+    points. The legend states what is left with the centres of pressure shifted.
+    """
     figure = new_figure(0.42)
     axes = figure.subplots()
     for carry in data.drawn:

@@ -235,11 +235,11 @@ def _draw_views(
 
 
 def facing(way: Array) -> View:
-    """Return an oblique view in which a motion comes towards the viewer, so that a machine does not
-    hide its arm.
+    """Return that one of two oblique views in which a direction points towards the viewer. Seen
+    along the direction from a robot's base to the box, the machine does not hide its arm.
 
     Args:
-        way: (3,) direction of the motion in the world.
+        way: (3,) the direction in the world.
     """
     return max(ISOMETRIC, OTHER_SIDE, key=lambda view: float(way @ view.towards))
 
