@@ -53,11 +53,12 @@ def possible_spins(contact: Contact, spins: Array) -> Array:
 
 
 def clear_spins(query: HoldQuery, kinematics: ArmKinematics, spins: Array) -> Array:
-    """Select rotations of an arm's pads about their normals at which hand, tool and pad are free of
-    collisions, at start and goal.
+    """Select rotations of an arm's pads about their normals at which the bodies of the arm's last
+    link (hand, tool and pad) do not collide, neither at the start nor at the goal.
 
-    They must neither enter the payload nor collide with fixed bodies. If no rotation is free, all
-    are returned. Within a shelf few rotations are free, and a search then tries only these.
+    They must not enter the payload and not touch bodies that are fixed in the world. If every
+    rotation collides, all rotations are returned. In a narrow place such as a shelf few rotations
+    are free, and the search for postures then tries only these.
 
     Args:
         query: box poses at start and goal.
@@ -113,7 +114,11 @@ def enters_payload(geometry: CellGeometry, kinematics: ArmKinematics, spin: floa
 
 
 def initial_arc(start: Array, goal: Array, bow: Array) -> Array:
-    """Compute a path of the box, and of m redundant joints, that bends aside in the middle.
+    """Compute a simple path of the box from start to goal, as an initial guess for the arms'
+    motion.
+
+    The path is straight in the numbers of the pose, plus half a sine wave of displacement that is
+    largest in the middle. The m redundant joints move at an even rate.
 
     Args:
         start: (6 + m,) first box pose [m, rad] followed by the m redundant joints [rad or m].
@@ -236,8 +241,10 @@ class HoldQuery:
 
 
 def find_holds(query: HoldQuery, kinematics: ArmKinematics, rng: np.random.Generator) -> HoldSearch:
-    """Find the postures with which an arm can hold the box from start to goal. Collisions with the
-    other arm do not count.
+    """Find holds of one arm: a rotation of its pad, and postures at start and goal between which
+    the arm can hold the box all the way.
+
+    Only the ends are checked for collisions, and collisions with the other arm do not count.
 
     Args:
         query: box poses and effort of the search.
@@ -245,7 +252,7 @@ def find_holds(query: HoldQuery, kinematics: ArmKinematics, rng: np.random.Gener
         rng: generator of random postures.
 
     Returns:
-        The holds, pairs of a start and a goal posture, with counts that explain a failure.
+        The holds, the best first, and counts that explain a failure.
     """
     finder = _Finder(query, kinematics, rng)
     found, contact = finder.found, kinematics.workcell.contacts[kinematics.arm]
@@ -345,10 +352,11 @@ class _Finder:
         return hit
 
     def lead(self, spin: Array, T_box_joint: Array, q: Array) -> None:
-        """Move the arm from each posture along guides, paths of the box to the goal, until enough
-        postures arrive.
+        """Find holds: move the arm with the box from each start posture to the goal, and store
+        every start posture that arrives there without a collision.
 
-        A posture that arrives without collision is added to the found holds.
+        The paths of the box in `GUIDES` are tried one after the other, each with the postures that
+        have not arrived yet, until `ENOUGH_HOLDS` holds are found.
 
         Args:
             spin: (n,) rotation of the pad about its normal, for each posture [rad].
@@ -378,7 +386,8 @@ class _Finder:
             waiting = np.delete(waiting, arrived)
 
     def _followed(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
-        """Move the arm from n postures along given poses of its last joint.
+        """Move the arm from n postures along given poses of its last joint, within joint limits and
+        away from singular postures.
 
         If the arm has redundant joints, these stay fixed for about half of the postures. For the
         other postures they move at an even rate to random positions.
@@ -390,7 +399,7 @@ class _Finder:
         Returns:
             - Indices of the postures that reach the last pose.
             - Joint paths (m, n, joints) of all postures [rad or m].
-            - Scores (n,) of all postures, larger is better.
+            - Scores (n,) of all paths by `path_score`, larger is better.
         """
         kinematics, redundant = self.kinematics, list(self.kinematics.redundant)
         ends = None
@@ -419,7 +428,8 @@ class _Finder:
         return arrived, path, path_score(kinematics, path, room, measure)
 
     def _stop(self, q: Array, measure: float, reaches: bool) -> str:
-        """Return the reason why a posture cannot be part of a path.
+        """Return as text why the arm cannot follow a path beyond a posture: it does not reach
+        farther, the posture is too near a singular one, or a joint is at its limit.
 
         Args:
             q: (joints,) posture [rad or m].
@@ -438,19 +448,20 @@ class _Finder:
         return f"{joint} is at its limit there"
 
     def _resolved(self, targets: Array, q: Array) -> tuple[NDArray[np.intp], Array, Array]:
-        """Move the arm from n postures along given poses of its last joint, with redundant joints
+        """Move the arm from n postures along given poses of its last joint; redundant joints are
         chosen anew at every pose.
 
-        Joint limits count at the last pose only, because the planned path may differ from these
-        paths.
+        Limits of joints and manipulability count at the last pose only, because the planned path
+        may differ from these paths.
 
         Args:
             targets: (m, n, 4, 4) poses of the last joint in the world, m for each posture.
             q: (n, joints) postures at the first pose [rad or m].
 
         Returns:
-            Indices of the postures that reach the last pose; joint paths (m, n, joints) [rad or m];
-            scores (n,), larger is better.
+            - Indices of the postures that reach the last pose.
+            - Joint paths (m, n, joints) of all postures [rad or m].
+            - Scores (n,) of all paths by `path_score`, larger is better.
         """
         kinematics, ends = self.kinematics, None
         if self.query.common is not None:
@@ -507,8 +518,8 @@ def path_score(kinematics: ArmKinematics, path: Array, room: Array, measure: Arr
 
 
 def manipulability_hint(kinematics: ArmKinematics, found: str) -> str:
-    """Return a sentence on a manipulability that is too small, with the key of its limit in the
-    file.
+    """Return a sentence which states that a manipulability is too small, the smallest allowed one,
+    and its key in the workcell file.
 
     Args:
         kinematics: the arm.
@@ -522,17 +533,19 @@ def manipulability_hint(kinematics: ArmKinematics, found: str) -> str:
 
 
 def _diverse(holds: Sequence[Hold], compared: int) -> list[Hold]:
-    """Sort holds such that different ones come first: each hold that differs much from all earlier
-    ones precedes the others.
+    """Sort holds such that clearly different ones come first, and remove near duplicates.
 
-    Of nearly equal holds only the first is kept.
+    Holds are compared by their start postures. A hold that differs by more than four times
+    `SAME_REDUNDANT` from all earlier ones goes to the first group; one that differs by no more than
+    `SAME_POSTURE` from an earlier one is removed; all others follow in a second group. Each group
+    keeps the given order.
 
     Args:
-        holds: the holds (pad rotation, start and goal posture), best first.
+        holds: the holds, best first.
         compared: number of joints, counted from the base, by which start postures are compared.
 
     Returns:
-        The kept holds.
+        The remaining holds.
     """
     first: list[Hold] = []
     later: list[Hold] = []

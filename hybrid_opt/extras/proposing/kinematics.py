@@ -189,7 +189,8 @@ class ArmKinematics:
         their ranges, as far as the poses leave them free.
 
         Args:
-            q: (n, joints) postures before [rad or m].
+            q: (n, joints) postures at which the search starts, such as those at the previous pose
+                of a path [rad or m].
             target: (n, 4, 4) wanted poses of the last joint in the world.
             held: indices of the joints that do not move.
         """
@@ -244,13 +245,15 @@ class ArmKinematics:
         return path, kept, measure
 
     def central(self, path: Array) -> Array:
-        """Compute the full turns that bring joint paths nearest to the middle of the joint limits.
+        """Compute by how many full turns each joint of a path may be shifted to lie nearest to the
+        middle of its limits.
 
         Args:
             path: (m, n, joints) n joint paths of m poses each [rad or m].
 
         Returns:
-            Angles (n, joints) to add to each path [rad]; zero for sliding and for redundant joints.
+            Angles (n, joints) to add to each path, multiples of 2 pi [rad]; zero for sliding and
+            for redundant joints.
         """
         middle = (self.lower + self.upper) / 2.0
         turns = np.round((middle - (path.min(axis=0) + path.max(axis=0)) / 2.0) / (2.0 * np.pi))
@@ -339,17 +342,17 @@ def has_wrist_spin(kinematics: ArmKinematics) -> bool:
 
 
 def pose_error(target: Array, T: Array) -> tuple[Array, Array]:
-    """Compute wanted poses minus actual poses, for Newton's method.
+    """Compute the error of poses as Newton's method uses it: wanted pose minus actual pose.
 
     Args:
         target: (n, 4, 4) wanted poses.
         T: (n, 4, 4) actual poses, in the same frame as `target`.
 
     Returns:
-        - Differences (n, 6), target position minus actual position [m], then the axis of the
-          rotation from the actual to the wanted orientation times the sine of its angle. Axes are
-          those of the common frame.
-        - Norm (n,) of position difference and rotation together.
+        - Errors (n, 6) along the axes of the common frame: difference of positions [m], then the
+          sine of the angle from the actual to the wanted orientation times the rotation axis.
+        - Magnitudes (n,) of the errors: root of the squared distance [m^2] plus a squared measure
+          of the angle, equal to the squared angle [rad^2] for small angles.
     """
     R, R_target = T[:, :3, :3], target[:, :3, :3]
     dR = R_target @ R.transpose(0, 2, 1)

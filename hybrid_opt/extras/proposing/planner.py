@@ -110,8 +110,10 @@ class Corridor:
 
 
 def search_subspace(start: Array, goal: Array, stray: Corridor, limits: Array) -> AffineSubspace:
-    """Compute the set of box poses and redundant joints in which a path from start to goal is
-    searched.
+    """Compute the bounded set of box poses and redundant joints in which a planner searches a path.
+
+    If the corridor allows no tilt, the box may rotate only as on the straight motion; otherwise
+    each angle varies on its own.
 
     Args:
         start, goal: (6 + m,) box pose [m, rad] followed by the m redundant joints [rad or m].
@@ -230,19 +232,20 @@ def plan(
     out_of_time: Callable[[], bool],
     rng: np.random.Generator,
 ) -> list[ChainConfiguration] | None:
-    """Find a collision-free path from start to goal by trees that grow; None if no path is found.
+    """Find a collision-free path of the box and both arms from start to goal by RRT-Connect.
 
     Args:
         chain: both arms, whose pads stay fixed on the box.
-        out: result of `retreats`: configurations along straight motions out of start and goal. They
-            become further roots of the trees.
+        out: result of `retreats`: configurations along straight motions out of start and goal.
+            Their last ones are further roots of both trees.
         room: box poses and redundant joints that the path may use.
         most: number of checked configurations after which the search ends.
         out_of_time: function that returns True if no time is left.
         rng: generator of random poses.
 
     Returns:
-        Configurations at the corners of the path; between them the box moves straight.
+        Configurations at the corners of the path, between which the box moves straight; None if no
+        path is found.
     """
     roots = [[ways[0][0], *_usable([way[-1] for way in ways], ways[0][0], room)] for ways in out]
     first, last = (
@@ -272,11 +275,11 @@ def plan(
 def _usable(
     stops: list[ChainConfiguration], end: ChainConfiguration, room: AffineSubspace
 ) -> list[ChainConfiguration]:
-    """Select the configurations that lie in the searched set and are at least `SHORT_RETREAT` away
-    from an end of the carry.
+    """Select the ends of retreats that can serve as roots of a planner's tree: they lie in the
+    searched set, at least `SHORT_RETREAT` away from the end of the carry.
 
     Args:
-        stops: the configurations.
+        stops: last configuration of each retreat.
         end: configuration at this end of the carry, the start or the goal.
         room: the searched set.
 

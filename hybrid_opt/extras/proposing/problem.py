@@ -177,8 +177,9 @@ class Problem:
     def other_contacts(self) -> list[list[dict[str, Any]]]:
         """Return further placements of the pads or hands on the box, the most promising first.
 
-        For pads these are all pairs of opposite faces: upright faces first, then those that face
-        the robots.
+        Hands have the further proposals of `hand_positions`. Pads have all other pairs of opposite
+        faces, each in both orders of the robots: upright faces first, then those that face the
+        robots.
 
         Returns:
             For each placement the two tables of contacts as they stand in a file; an empty list if
@@ -213,14 +214,16 @@ class Problem:
         return found[0], found[1]
 
     def sides(self) -> list[Problem]:
-        """Return copies of the problem whose pads or hands are placed on different sides of the
-        box.
+        """Return copies of the problem that place its pads or hands on different sides of the box.
 
-        Hands are at the best proposals of `hand_positions`, one copy for each. For pads there is
-        one copy for each pair of opposite upright faces; for a machine with two arms also one with
-        exchanged arms. Only the problem itself is returned if the file states the positions, or if
-        two separate robots move the box so far horizontally that the direction of the carry
-        determines the faces.
+        - Hands: one copy for each of the `MOST_SIDES` best proposals of `hand_positions`.
+        - Pads of a machine with two arms: two copies for each pair of opposite upright faces, the
+          second one with exchanged arms.
+        - Pads of two separate robots: one copy for each such pair. If the box moves horizontally by
+          `LEAST_LEVEL` or more, the direction of the carry determines the faces, and only the
+          problem itself is returned.
+
+        Only the problem itself is returned, too, if the file states the positions.
         """
         entries = self.data["contacts"]
         start, goal = self.poses
@@ -392,14 +395,19 @@ def _require_known(table: TableReader) -> None:
 def contact_points(
     size: Array, way: Array, R_world_box: Array, bases: Array | None
 ) -> list[list[float]]:
-    """Compute the centres (3,) of two opposite faces of the box, in the box frame [m]. The first
-    faces robot 1 and the second faces robot 2.
+    """Choose two opposite upright faces of the box for the pads, and return their centres.
+
+    With bases, the faces are those that face the robots. Without bases, they are those whose
+    normals are most nearly perpendicular to the direction of the carry.
 
     Args:
         size: (3,) edges of the box [m].
         way: (2, 6) start and goal of the box [m, rad].
         R_world_box: (3, 3) rotation of the box at the start.
-        bases: (2, 3) positions of the robots [m]; None for the faces that are lateral to the carry.
+        bases: (2, 3) positions of the robots in the world [m]; None if they are not known.
+
+    Returns:
+        Centre (3,) of the face of robot 1, then of robot 2, box frame [m].
     """
     along = way[1, :3] - way[0, :3] if bases is None else bases[0] - bases[1]
     share = np.abs(R_world_box.T @ (along * [1.0, 1.0, 0.0]))

@@ -180,8 +180,10 @@ class Proposal:
 
     @property
     def passes(self) -> str:
-        """Text that names the obstacles and the sides on which the carry passes them; 'nothing' if
-        the box meets only its support on a straight motion."""
+        """Text that names the obstacles of the straight motion from start to goal, and the side on
+        which the carry passes each of them; 'nothing' if there are none. Bodies that the box
+        touches at the start or goal, such as its support, do not count.
+        """
         return " and ".join(self.sides) or "nothing"
 
     def text(self, folder: Path) -> str:
@@ -224,8 +226,8 @@ def propose(
 ) -> Proposal:
     """Propose a complete workcell, with a first carry, for a problem file.
 
-    Where the settings ask for several classes of carries, the carry with the shortest joint paths
-    is returned.
+    If the settings ask for several classes of carries, which pass obstacles on different sides or
+    start in other postures, the carry with the shortest joint paths is returned.
 
     Args:
         path: a problem file (docs/tutorials/two-robots.md).
@@ -465,11 +467,16 @@ class _Search:
             )
 
     def _via_points(self, pair: Pair, corners: list[ChainConfiguration]) -> Array | None:
-        """Find the fewest via-points whose spline follows the path with these corners without
-        collision.
+        """Find a collision-free spline from start to goal that replaces a path with corners, with
+        as few via-points as possible.
+
+        Args:
+            pair: how both arms hold the box at the start and at the goal.
+            corners: configurations at the corners of the collision-free path.
 
         Returns:
-            (k, 6 + m) box poses [m, rad] and m redundant joints [rad or m]; None if there are none.
+            The via-points (k, 6 + m), box poses [m, rad] and m redundant joints [rad or m]; None if
+            none were found.
         """
         self._say("via-points")
         dense = remove_corners(pair.chain, corners, self.rng)
@@ -482,9 +489,17 @@ class _Search:
     def _judged(
         self, setup: Setup, pair: Pair, via: Array, box: PayloadSceneChecker
     ) -> Iterator[Proposal]:
-        """Evaluate the carry through the via-points `via` (k, 6 + m), box poses [m, rad] and m
-        redundant joints [rad or m], and yield its proposal. Yield nothing if the evaluator refuses
-        the carry, or if a carry of its class was found before."""
+        """Shorten the spline through given via-points, evaluate its carry, and yield the proposal.
+
+        Nothing is yielded if the carry is not feasible, or if a carry with the same holds that
+        passes obstacles on the same sides was found before.
+
+        Args:
+            setup: the cell with its placed robots.
+            pair: how both arms hold the box at the start and at the goal.
+            via: (k, 6 + m) via-points, box poses [m, rad] and m redundant joints [rad or m].
+            box: collision checker of the box, which names the passed sides.
+        """
         fitted = np.vstack([pair.start.extended, via, pair.goal.extended])
         if self._is_known(pair, box, _poses(fitted)):
             return
@@ -575,8 +590,12 @@ class _Search:
         return self.problem.workcell(changes(self.problem, found))
 
     def _bounds(self, trial: Trial, until: float) -> Bounds:
-        """Find bounds of the decision vector around the carry of `trial`, until the time `until`
-        [s] after the start of the whole search."""
+        """Find bounds of the decision variables around the carry of `trial` by random sampling.
+
+        Args:
+            trial: the carry, with its evaluator.
+            until: time after the start of the whole search at which sampling ends [s].
+        """
         unit, limits = decision_bounds(trial.workcell)
         low, high = self.settings.feasible
         sampling = Sampling(

@@ -52,17 +52,20 @@ def _collisions(workcell: Workcell) -> JobCollisions:
 
 
 def plan_reach(job: Job, q: Array, *, rng: np.random.Generator, after: bool = False) -> Array:
-    """Plan the path of both arms to a job's first position, free of collisions throughout.
+    """Plan a collision-free path of both arms from given joint positions to the first position of a
+    job, or from the last position of a job to them.
 
     Args:
         job: the job.
-        q: (joints,) joint positions of both arms, side by side [rad, or m for a sliding joint].
+        q: (joints,) the given joint positions of both arms, side by side [rad, or m for a sliding
+            joint].
         rng: generator of all random numbers.
-        after: True for the path from the job's last position to q.
+        after: False for the path to the job's first position, True for the path from its last
+            position.
 
     Returns:
-        (n, joints) corners, both ends included. Between corners both arms move along straight lines
-        of their joints, in the same time.
+        (n, joints) corners of the path in order of time, both ends included. Between corners both
+        arms move along straight lines of their joints, in the same time.
 
     Raises:
         SettingsError: q does not fit the cell or exceeds a joint's limits.
@@ -160,7 +163,7 @@ def _connected(
     bounds: tuple[Array, Array],
     rng: np.random.Generator,
 ) -> list[Array]:
-    """Find the corners of a path of both arms by trees that grow.
+    """Find a path of both arms by RRT-Connect; only its sampled positions are free of collisions.
 
     Args:
         lines: collision checker of straight motions.
@@ -170,7 +173,7 @@ def _connected(
         rng: generator of random positions.
 
     Returns:
-        Corners (joints,), both ends included.
+        Corners (joints,) of the path, both ends included.
 
     Raises:
         JobError: no path is found.
@@ -197,8 +200,10 @@ def _connected(
 
 
 def _shortened(lines: _Lines, corners: list[Array]) -> list[Array]:
-    """Remove corners of a path as long as the remaining ones are connected by lines that are proven
-    free.
+    """Shorten a path: replace parts of it by straight lines that are proven free of collisions.
+
+    From each corner the line to the farthest such corner is taken; if there is none, the path
+    continues to the next corner.
 
     Args:
         lines: collision checker of straight motions.

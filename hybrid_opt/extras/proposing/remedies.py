@@ -123,13 +123,16 @@ def least_changes(
     kinds: Sequence[ProblemChange] = PROBLEM_CHANGES,
     amounts: Sequence[float] = AMOUNTS,
 ) -> list[tuple[ProblemChange, float]]:
-    """Find the smallest change of each kind with which both arms can hold the box.
+    """Find for each kind of change of a problem the smallest tried amount with which both arms can
+    hold the box.
+
+    The search ends when `ENOUGH_CHANGES` kinds are found, or when `is_over` returns True.
 
     Args:
         problem: problem whose file states the bases and the pads' positions.
         can_hold: function that returns True for a problem in which both arms can hold the box.
         is_over: function that returns True if the search has to end.
-        kinds: kinds of changes that are tried.
+        kinds: kinds of changes that are tried, each alone.
         amounts: amounts that are tried, the smallest first [m].
 
     Returns:

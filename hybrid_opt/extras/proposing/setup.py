@@ -84,8 +84,11 @@ def ranked_pairs(
     holds: Iterable[tuple[Hold, Hold]],
     ends: tuple[Array, Array],
 ) -> list[Pair]:
-    """Select pairs of holds, one hold per arm, in which the arms do not collide at start and goal,
-    the most promising first. A hold is a pad rotation with a start and a goal posture.
+    """Find the pairs of holds, one per arm, with which the arms do not collide at start and goal;
+    the most promising pair first. A hold is a pad rotation with a start and a goal posture.
+
+    A pair is promising if the arms can follow much of a box path without a collision, and if its
+    holds have high scores.
 
     Args:
         workcell: the cell, with chosen redundant joints.
@@ -142,9 +145,10 @@ def _free(judge: PoseJudge, *configurations: ChainConfiguration) -> bool:
 
 
 def _free_share(chain: ClosedChain, start: ChainConfiguration, goal: ChainConfiguration) -> float:
-    """Compute the share of a box path that both arms can follow without collision: the mean of the
-    shares forwards from the start and backwards from the goal. The largest of several paths in
-    `GUIDES` is returned.
+    """Compute how much of a box path both arms can follow without collision, from 0 to 1.
+
+    It is the mean of two shares: the one followed from the start forwards, and the one followed
+    from the goal backwards. The best one of the first `RANKING_GUIDES` paths in `GUIDES` counts.
 
     Args:
         chain: both arms, whose pads stay fixed on the box.
@@ -245,30 +249,30 @@ def prepare(
 
 
 def _progress(searches: Sequence[HoldSearch]) -> tuple[float, ...]:
-    """Rank results of the search for holds (pad rotations with start and goal posture) by the less
-    successful arm.
+    """Return a key that sorts searches for holds (pad rotations with start and goal posture) by
+    their success.
+
+    It has four numbers, larger is better: number of holds, largest share of a box path that was
+    followed, number of collision-free start postures, number of start postures. The numbers are
+    those of the less successful arm.
 
     Args:
         searches: result for each arm, or for both on common joints.
-
-    Returns:
-        Four numbers of the less successful arm, compared in this order and larger if better: number
-        of holds, share of a box path that was followed, number of collision-free postures, number
-        of postures.
     """
     return min((len(one.holds), one.kept, one.free, one.within) for one in searches)
 
 
 def redundancy(problem: Problem, workcell: Workcell) -> dict[str, Any]:
-    """Choose the redundant joints of arms with more than six joints, unless the file names them.
-    They start at the middle of their ranges.
+    """Choose the redundant joints of arms with more than six joints, and their initial positions,
+    the middle of their ranges. Redundant joints that the file names are kept.
 
     Args:
         problem: the problem.
         workcell: its cell.
 
     Returns:
-        Additions to the tables `robots` and `task` of the problem.
+        Additions to the tables `robots` and `task` of the problem; empty if no arm has more than
+        six joints.
     """
     robots: list[dict[str, Any]] = [{}, {}]
     entries: dict[str, dict[str, Any]] = {}
@@ -291,9 +295,11 @@ def redundancy(problem: Problem, workcell: Workcell) -> dict[str, Any]:
 
 
 def redundant_joints(workcell: Workcell, arm: int, common: tuple[str, ...]) -> tuple[int, ...]:
-    """Choose the redundant joints of an arm such that the other six are best conditioned: the
-    smallest singular value of their Jacobian is largest, in the median of random postures. Joints
-    that move both arms and sliding joints are chosen first.
+    """Choose the redundant joints of an arm: all joints but six.
+
+    Joints that move both arms come first, then sliding joints. The remaining ones are chosen such
+    that the other six joints are best conditioned: over random postures, the median of the smallest
+    singular value of their Jacobian is largest.
 
     Args:
         workcell: the cell.

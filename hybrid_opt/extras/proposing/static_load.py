@@ -58,7 +58,8 @@ class StaticLoad:
         self.checked = bool(self._shares(pose, q, np.eye(4)).max() > NEAR * MOST_TORQUE)
 
     def share(self, pose: Array, q: Array, T_box_joint: Array) -> Array:
-        """Compute the largest share (n,) of a joint's torque limit that n postures take.
+        """Compute for each of n postures the largest ratio (n,) of a joint torque to its limit
+        while the arm holds the box at rest; 0 for a strong arm, see `checked`.
 
         Args:
             pose: (n, 6) poses of the box [m, rad].

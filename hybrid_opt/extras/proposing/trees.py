@@ -34,19 +34,19 @@ def connect(
     same: Callable[[Configuration, Configuration], bool],
     ended: Callable[[], bool],
 ) -> list[Configuration] | None:
-    """Find the corners of a path between two sets of points; None if no path is found.
+    """Find a path of free straight motions between two sets of points by RRT-Connect.
 
     Args:
         ends: points (n, d) at which the path may begin, with their configurations, and those at
             which it may end.
-        longest: longest motion by which the trees grow, in the unit of the points.
-        draw: function that returns a number of random points (n, d).
-        join: function that follows motions.
+        longest: length of the longest motion by which a tree grows, in the unit of the points.
+        draw: function that returns a given number k of random points (k, d).
+        join: function that follows straight motions, see `Join`.
         same: function that returns True if two configurations at one point are the same.
         ended: function that returns True if the search has to end.
 
     Returns:
-        The configurations at the corners, both ends included.
+        The configurations at the corners of the path, both ends included; None if no path is found.
     """
     trees, grows = [_Tree(*end, longest, join) for end in ends], 0
     while not ended():
@@ -89,14 +89,16 @@ class _Tree(Generic[Configuration]):
     def grow(
         self, begins: NDArray[np.intp], targets: Array
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Grow from points of the tree towards targets, by one motion each.
+        """Grow the tree by one motion from each of k of its points, straight towards a target and
+        at most as long as the longest motion. Motions that are not free add no point.
 
         Args:
             begins: (k,) indices of the points.
             targets: (k, d) the targets.
 
         Returns:
-            Indices (n,) of the new points, and of their targets (n,).
+            Indices (n,) of the new points in the tree; and for each of them the index (n,) of its
+            target.
         """
         away = targets - self.points[begins]
         share = self._longest / np.maximum(np.linalg.norm(away, axis=1), self._longest)
@@ -125,17 +127,19 @@ def _meeting(
     same: Callable[[Configuration, Configuration], bool],
     ended: Callable[[], bool],
 ) -> tuple[int, int] | None:
-    """Grow a tree towards new points of the own one, until it arrives or no motion is free.
+    """Grow one tree, motion after motion, towards the new points of the other tree, until it
+    reaches one of them or no motion is free.
 
     Args:
-        own: tree that has grown.
-        other: tree that grows.
+        own: tree that got the new points.
+        other: tree that grows towards them.
         new: (n,) indices of the new points in `own`.
         same: function that returns True if two configurations at one point are the same.
         ended: function that returns True if the search has to end.
 
     Returns:
-        Index in both trees of the point at which they meet; None if they do not meet.
+        Index in `own` and index in `other` of the point at which the trees meet; None if they do
+        not meet.
     """
     begins = other.nearest(own.points[new])
     while len(new) and not ended():
@@ -150,15 +154,15 @@ def _meeting(
 
 
 def inner_points(counts: NDArray[np.intp]) -> list[tuple[NDArray[np.intp], Array]]:
-    """Return points between the ends of k motions, in two sets: a point near the middle of each
-    motion, then all others.
+    """Return the inner points of k motions in the order in which they are best checked for
+    collisions: first a point near the middle of each motion, then all others.
 
     Args:
         counts: (k,) number of equal parts into which each motion is divided.
 
     Returns:
-        Two sets of n points, each as the index (n,) of the motion, and the share (n,) of the motion
-        before the point.
+        Two sets of n points, each as the index (n,) of the motion, and the place (n,) on the
+        motion, from 0 at its beginning to 1 at its end.
     """
     which = np.repeat(np.arange(len(counts)), np.maximum(counts - 1, 0))
     first = np.concatenate([[0], np.cumsum(np.maximum(counts - 1, 0))])[:-1]

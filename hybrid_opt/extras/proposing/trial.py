@@ -302,8 +302,8 @@ class PoseJudge:
             pose: (6,) pose of the box [m, rad].
 
         Returns:
-            Names of the bodies, each with True if the box penetrates it deeper than a resting box
-            may.
+            Names of the bodies. Each has True if the box penetrates the body, and False if it only
+            rests on it, within a tolerance.
         """
         names = [
             (k, pair) for k, pair in enumerate(self.geometry.pair_names) if PAYLOAD_NAME in pair
@@ -386,15 +386,15 @@ class Trial:
         bodies: CellBodies | None = None,
         named: bool = True,
     ) -> None:
-        """Build the model and find the start branches.
+        """Build the model and the evaluator of the proposed cell, with given postures at the start.
 
         Args:
             workcell: the proposed cell.
             start: postures (joints,) of both arms at the beginning of the carry [rad or m].
             bodies: arms and bodies of the cell, if known from a trial of another carry; None to
                 compute them.
-            named: True to find the indices of the branches; False to leave them at -1 and use the
-                postures themselves.
+            named: True to find the index of each posture among the arm's start branches; False to
+                leave the indices at -1, which is faster.
 
         Raises:
             BranchLostError: a posture is not among the start branches.
@@ -571,7 +571,8 @@ def grasp_blocked(trial: Trial, handling: Handling) -> str:
     """Return a text on what blocks the pads before or after a carry: at their approach, the lift,
     the set-down or their retreat.
 
-    The text is '' if nothing blocks them, or if no jobs are planned for such pads.
+    The text is '' if nothing blocks them. It is also '' for other contacts than two opposite round
+    pads, which are not checked.
 
     Args:
         trial: the carry, with its evaluator.

@@ -256,8 +256,8 @@ def _lengths(chain: ClosedChain, paths: Array, near: tuple[Array, Array]) -> tup
 
 
 def free_share(chain: ClosedChain, start: ChainConfiguration, waypoints: Array) -> float:
-    """Compute the share of a spline before its first collision, or the first pose at which an arm
-    cannot hold the box.
+    """Compute which share of a spline both arms can follow, from 0 to 1: the share before the first
+    collision, or before the first pose at which an arm cannot hold the box.
 
     Args:
         chain: both arms, whose pads stay fixed on the box.
