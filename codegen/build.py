@@ -95,9 +95,9 @@ class CSource:
         Args:
             name: name of the function in its set.
             function: the function.
-            lanes: number of evaluations that the text makes side by side by vector instructions; 0
-                for the machine's width. A function that cannot be written so is evaluated one by
-                one, with a warning.
+            lanes: number of evaluations that run side by side in vector instructions; 0 for the
+                machine's width. If the function has no vectorised form, a warning is issued and the
+                text evaluates one input at a time.
             level: optimisation level of the compiler, 0 to 3; None to choose by the size of the
                 text.
         """
@@ -393,23 +393,24 @@ def load_or_build_program(
 ) -> ctypes.CDLL:
     """Load or build one library of CasADi functions in lanes and of handwritten C that calls them.
 
-    This pays if calls through NumPy would cost more than the functions: intermediate results stay
-    in lanes. See `codegen.source.program_source`.
+    A lane is one of the evaluations that a vector instruction makes side by side. The C code passes
+    results from function to function without leaving the lanes. This saves time if the functions
+    are so short that calls through NumPy would take longer. See `codegen.source.program_source`.
 
     Args:
         name: name of the program, for messages.
         key: digest of everything on which `make` depends, except the version of CasADi.
         make: function that returns the CasADi functions, by the names under which `own` calls them.
-        own: handwritten C, which follows the functions in the text.
+        own: handwritten C, appended to the C text of the functions.
         cache: cache of the library; None for the user's.
         lanes: number of evaluations side by side; 0 for the machine's width.
 
     Returns:
-        The library. Its C function `dual_arm_lanes()` returns the number of lanes; if that is 1,
-        the machine has no lanes and the library no other function.
+        The library. Its C function `dual_arm_lanes()` returns the number of lanes. If this is 1,
+        the machine has no vector instructions for lanes, and the library has no other function.
 
     Raises:
-        CodegenError: as in `load_or_compile`, or a function has no form in lanes.
+        CodegenError: as in `load_or_compile`, or a function has no vectorised form.
     """
 
     cache = cache or Cache()
@@ -533,11 +534,20 @@ def _compiled(
 def _begin(
     source: CSource, compiler: Compiler, cache: Cache, pool: ThreadPoolExecutor, rebuild: bool
 ) -> Future[tuple[Library, bool]]:
-    """Start to compile a source in the threads of `pool`, or take its library from the cache unless
-    `rebuild`. The future has the library, and True if it was cached.
+    """Start to compile a source in the threads of `pool`, or load its library from the cache.
 
-    The pool starts work in order, so the object files of functions that are compiled separately are
-    begun before the library that links them.
+    The pool starts work in order. The object files of separately compiled functions are therefore
+    started before the library that links them.
+
+    Args:
+        source: the C text.
+        compiler: the compiler.
+        cache: cache of the library.
+        pool: threads that compile.
+        rebuild: True to compile even if the library is in the cache.
+
+    Returns:
+        Future of the library, and True if it came from the cache.
     """
     flags = () if source.lanes == 1 else LANE_FLAGS
     rest, parts = in_parts(source.text, source.most)

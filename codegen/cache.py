@@ -59,19 +59,19 @@ _KEY_END = re.compile("[-.]")
 def key_of(what: str, **parts: object) -> str:
     """Return the key of a cache entry: a digest of its kind and of all its ingredients.
 
-    Every key of a cache is computed here. The ingredients of each kind are::
+    Every key of a cache is computed here. Some kinds and their ingredients::
 
       library        text of the source, compiler, its level and flags (`codegen.build`)
       part           the same for an object file that several libraries share
-      set            key of the recipe, lanes and levels, compiler, CasADi, code of `codegen`
-      recipe         structure of a cell, and the code that makes its expressions
+      set            key of the set's recipe, lanes and levels, compiler, CasADi, code of `codegen`
+      recipe         topology of a cell, and the code that makes its expressions
                      (`hybrid_opt.compiled_cell`)
       code           sources of packages, without comments (`Cache.code_digest`)
-      compiler       processor; the entry names the compiler (`codegen.build.compiler_of`)
+      compiler       type of processor (`codegen.build.compiler_of`)
 
     Args:
-        what: the kind.
-        parts: the ingredients by name.
+        what: kind of the entry.
+        parts: its ingredients by name.
     """
     named = [f"{name}={value}" for name, value in sorted(parts.items())]
     return digest(what, str(CACHE_FORMAT), *named)
@@ -256,7 +256,8 @@ class Cache:
         return facts
 
     def write_record(self, key: str, facts: Mapping[str, Any]) -> None:
-        """Store a JSON object `facts` under a key, with its checksum, in one step."""
+        """Store a JSON object `facts` under a key, with its checksum. Readers see the old file or
+        the complete new one, never a part."""
         text = json.dumps({"facts": facts, "sha256": digest(_canonical(facts))}, indent=1)
         self._make_folder()
         with _writing(self.folder):

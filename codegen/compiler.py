@@ -105,9 +105,10 @@ _INTERRUPTED = threading.Event()
 
 @contextmanager
 def interruptible() -> Iterator[None]:
-    """End all compilers of this process on Ctrl-C in the `with` block, and start no new ones.
+    """Kill all compiler processes of this process if Ctrl-C is pressed in the `with` block.
 
-    Compilation starts again when the main thread asks for the next function.
+    Worker threads then start no further compilers. A new block in the main thread allows them
+    again.
     """
     if threading.current_thread() is threading.main_thread():
         _INTERRUPTED.clear()
@@ -169,17 +170,16 @@ class Compiler:
         flags: tuple[str, ...] = (),
         objects: Sequence[Path] | None = (),
     ) -> None:
-        """Compile one C file at optimisation `level` (0 to 3) into a shared library.
+        """Compile one C file to a shared library or, with `objects` None, to an object file.
 
         At most one compiler per core runs at a time.
 
         Args:
             source: the C file.
             result: the file to write.
-            level: optimisation level.
+            level: optimisation level, 0 to 3.
             flags: further flags.
-            objects: object files that are linked into the library; None to compile the source to an
-                object file instead of a library.
+            objects: object files that are linked into the library; None to write an object file.
 
         Raises:
             CodegenError: the compiler refused the source, could not write, or was killed.
@@ -193,10 +193,13 @@ class Compiler:
             self._run(command, source, result)
 
     def self_test(self, folder: Path) -> None:
-        """Test the compiler: compile a part at every level, link the parts into a library at every
-        level, load it and call it.
+        """Test the compiler by small C files with a known result.
 
-        The test takes gcc 0.3 s of CPU time. All files are made in an empty folder of the cache.
+        At every optimisation level one object file is compiled. At every level all of them are then
+        linked into a library, which is loaded and called. This takes gcc 0.3 s of CPU time.
+
+        Args:
+            folder: an empty folder of the cache, for all files of the test.
 
         Raises:
             CodegenError: a step fails, or a library computes a wrong result.
@@ -298,7 +301,7 @@ def part_level(c_bytes: int, in_lanes: bool) -> int:
 
     Args:
         c_bytes: size of the function's C text [bytes].
-        in_lanes: whether the function is written for lanes.
+        in_lanes: True if the function evaluates several inputs side by side in vector instructions.
     """
     level = LANE_LEVEL if in_lanes else default_level(c_bytes)
     return level if c_bytes < LONG_PART else min(level, 1 if in_lanes else 2)

@@ -276,8 +276,9 @@ class NumericFunction(ABC):
             outputs: arrays for the results.
 
         Returns:
-            A function that evaluates the first k items of the batch, given k; and a function that
-            returns the addresses with which C code evaluates the batch, or None if C cannot.
+            - Function of k that evaluates the first k items of the batch.
+            - Function that returns the addresses by which other C code calls this evaluation; None
+              if the function is interpreted, so that C code cannot call it.
         """
 
         def run(count: int) -> None:
@@ -390,7 +391,7 @@ class PreparedBatch:
 
     @property
     def native(self) -> NativeCall | None:
-        """Addresses with which C code evaluates the batch in the calling thread; None for
+        """Addresses by which other C code evaluates this batch in the calling thread; None for
         interpreted functions."""
         return None if self._native is None else self._native()
 

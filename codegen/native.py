@@ -145,13 +145,14 @@ class CompiledFunction(NumericFunction):
             future.result()
 
     def _require_one_value(self, batched: Sequence[bool]) -> None:
-        """Check that no input that is shared by all lanes is given with one value per evaluation.
+        """Check that every input declared as shared by all lanes has a single value for the whole
+        batch.
 
         Args:
             batched: for each input, True if it is given with one value per evaluation.
 
         Raises:
-            CodegenError: such an input has one value per evaluation.
+            CodegenError: a shared input is given with one value per evaluation.
         """
         for name, several, shared in zip(
             self.signature.input_names, batched, self._shared, strict=True
@@ -175,8 +176,8 @@ class CompiledFunction(NumericFunction):
         return run, lambda: self._native(begin_of_ports)
 
     def _native(self, of_batch: int) -> NativeCall:
-        """Return the addresses with which C code evaluates a batch: the compiled functions, the
-        batch and work memory of this thread.
+        """Return the addresses by which other C code evaluates a batch: the compiled functions, the
+        batch, and work memory of this thread.
 
         Args:
             of_batch: address of the descriptions of arguments and results, from `ports`.
@@ -200,8 +201,11 @@ class CompiledFunction(NumericFunction):
             )
 
     def _lanes_agree(self) -> bool:
-        """Return True if a batch that does not fill the lanes gives the same bits as single
-        evaluations."""
+        """Return True if evaluation in lanes and single evaluations give the same bits.
+
+        The test evaluates random inputs, one more than there are lanes, so that the last lanes stay
+        partly unused.
+        """
         rng = np.random.default_rng(0)
         n = self.lanes + 1
         batched = [not shared for shared in self._shared]

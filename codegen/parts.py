@@ -87,14 +87,17 @@ class CodePart:
 
 
 def in_parts(text: str, most: int = 3) -> tuple[str, tuple[CodePart, ...]]:
-    """Replace long functions of a C text by declarations, so that they are compiled separately.
+    """Move the long functions of a C text into separate texts, so that they compile in parallel and
+    several libraries share their object files.
+
+    Only functions that call no other one are moved. A declaration stays in their place.
 
     Args:
         text: C text from `codegen.source`.
-        most: highest optimisation level of a separate function.
+        most: highest optimisation level of a moved function.
 
     Returns:
-        The text with declarations, and the removed functions, each once.
+        The text with declarations, and the moved functions without duplicates.
     """
     before = {
         "casadi": _preamble(*(["one_lane.h"] if "dual_arm_sin" in text else []), "part.h"),
@@ -137,8 +140,8 @@ def in_parts(text: str, most: int = 3) -> tuple[str, tuple[CodePart, ...]]:
 
 
 def _width(text: str) -> str:
-    """Return the line of a C text that states the number of its lanes, directly before `lanes.h`;
-    empty if the text takes the machine's width or has no lanes."""
+    """Return the line of a C text that defines the number of lanes; '' if the text takes the
+    machine's width or has no lanes. The line stands directly before the text of `lanes.h`."""
     before = text.partition(runtime("lanes.h"))[0]
     stated = re.search(r"^#define DUAL_ARM_LANES \d+\n\Z", before, re.M)
     return stated[0] if stated else ""
@@ -157,12 +160,18 @@ def _preamble(*runtimes: str) -> str:
 
 
 def is_long(body: str) -> bool:
-    """Return True if a function is so long that it is cut into pieces."""
+    """Return True if the body of a C function has so many statements that `in_pieces` cuts it, at
+    least `CUT_STATEMENTS`."""
     return body.count("\n") >= CUT_STATEMENTS
 
 
 def in_pieces(text: str) -> str:
-    """Cut the long straight-line functions of a C text into pieces. The text may be for lanes."""
+    """Cut the long functions of a C text into pieces of some hundred statements, which compile
+    faster.
+
+    Only straight-line functions are cut, with lanes or without. The same statements run in the same
+    order.
+    """
     return _STRAIGHT.sub(_cut, text)
 
 

@@ -82,7 +82,8 @@ def handwritten_source(
         text: C that defines `NAME` with CasADi's interface (arguments, results and work memory by
             address), and `NAME_work`, `NAME_incref`, `NAME_checkout`, `NAME_release`.
         helpers: dense CasADi functions that the text calls. Their C is put before the text.
-        in_pairs: functions that the text calls in two lanes, by name.
+        in_pairs: further CasADi functions by name, which evaluate two inputs side by side in two
+            lanes; their C is put before the text too.
 
     Raises:
         CodegenError: CasADi cannot write a helper as C, or its C cannot be translated to lanes.
@@ -115,7 +116,8 @@ def program_source(functions: Mapping[str, ca.Function], own: str, lanes: int = 
 
 
 def _lanes_header(lanes: int) -> list[str]:
-    """Return pieces of C text that define the types of lanes.
+    """Return pieces of C text that define the C types of lanes and the arithmetic on them. A value
+    of such a type holds one number per lane, for evaluations side by side.
 
     Args:
         lanes: number of lanes; 0 for the width of the machine that compiles.
@@ -183,12 +185,13 @@ def generated_c(functions: Sequence[ca.Function]) -> str:
 
 
 def _filled(driver: str, signature: Signature, generated: str = "") -> str:
-    """Fill the placeholders of a driver's C text for one function.
+    """Fill the placeholders of a batch driver's C text for one function.
 
     Args:
         driver: C text with placeholders.
         signature: name and sizes of the function.
-        generated: C code of the function; the driver must know whether this code keeps state.
+        generated: CasADi's C code of the function. If it keeps state between calls, the driver is
+            told so; '' for code without state.
     """
     inputs = [prod(shape) for shape in signature.input_shapes]
     outputs = [prod(shape) for shape in signature.output_shapes]
