@@ -68,7 +68,12 @@ def compare_timings(
     curve_points: int | None = None,
     progress: ShowProgress = False,
 ) -> TimedTrajectory:
-    """Compare the timing of the search with drivable timings of the same path, with margins.
+    """Compute several timings of one path, to compare them.
+
+    They are the timing of the search, the fastest one within the task's reference speeds, the
+    fastest one, and those that the arguments ask for
+    (`hybrid_opt.timing.analysis.time_trajectory`). For the timing within the reference speeds the
+    result also has margins: the largest errors of the workcell's description that it tolerates.
 
     Args:
         cell: the cell of the carry.
@@ -77,8 +82,8 @@ def compare_timings(
             such timing.
         curve_points: number of points on the curve of duration against force limit, None for no
             curve.
-        progress: True for a progress bar, or a function that is called with the number of
-            timings done and their total; all margins together count as one timing.
+        progress: True for a progress bar, or a function that is called with the number of timings
+            done and their total. The computation of the margins counts as one more timing.
     """
     return time_trajectory(
         cell.timing_model, decision_of(carry), force_limit, curve_points, progress=progress

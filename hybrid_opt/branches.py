@@ -149,7 +149,8 @@ class _Pair:
         return bool(np.any(np.all(found.violation[:, _HOLDING] <= 0.0, axis=1)))
 
     def result(self) -> PairResult:
-        """Return the figures of this pair of start branches over all its candidates."""
+        """Return the result of this pair of start branches: number of evaluations, share of
+        feasible candidates, hypervolume of their front and least penalty."""
         known = concatenated(self._parts)
         rows = front_rows(known.objectives, known.feasible)
         volume = hypervolume(known.objectives[rows], REFERENCE_POINT) if len(rows) else 0.0
@@ -173,8 +174,9 @@ def search_branches(
 ) -> BranchCompetition:
     """Find the best pair of start branches, one for each arm, by a competition.
 
-    A pair takes part if the arms can follow the hand-made trajectory, or one of some random
-    trajectories, with it. If a robot's `start_branch` in the workcell file is a number, only this
+    In each round every remaining pair gets a search, and the worse half of the pairs is eliminated.
+    A pair takes part if the arms can follow at least one trajectory with it: the hand-made one or
+    one of some random ones. If a robot's `start_branch` in the workcell file is a number, only this
     branch of the robot takes part.
 
     Args:
@@ -187,8 +189,8 @@ def search_branches(
             done and their total.
 
     Raises:
-        SettingsError: candidates of this cell cannot be evaluated with other start branches, or the
-            cell does not have two objectives.
+        SettingsError: the compiled kernel, which a change of start branches needs, is not available
+            for this cell; or the cell does not have two objectives.
         WorkcellError: the arms cannot follow any tried trajectory with any pair.
     """
     if cell.workcell.task.law.is_drivable:
@@ -235,7 +237,10 @@ def search_branches(
 
 
 def _from_rest_to_rest(cell: Cell) -> Cell:
-    """Return the cell with the time law 'ramped' and the paper's objectives."""
+    """Return a drivable cell with the time law 'ramped' and both peak normal forces as objectives.
+
+    Candidates of this cell are evaluated faster, and reach and collide in the same way.
+    """
     task = replace(cell.workcell.task, time_law=RAMPED)
     return Cell(replace(cell.workcell, task=task), PAPER_OBJECTIVES, cell.threads)
 

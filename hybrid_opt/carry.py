@@ -419,12 +419,12 @@ def _arm(
 def _joint_rates(
     workcell: Workcell, x: Array, q: Array, outputs: Mapping[str, Array]
 ) -> tuple[Array, Array]:
-    """Compute the first and second time derivative of one arm's joint positions.
+    """Compute the first and second time derivative (n, n_joints) of one arm's joint positions.
 
     Under the time law 'constant' they are second-order finite differences over the time of the
     samples, one-sided at the ends, as the paper differentiates the box pose. Under 'ramped' they
-    are finite differences over the path parameter u, combined with the law's own u' and u'': so the
-    arm rests wherever the box rests.
+    are finite differences over the path parameter u, multiplied with the time derivatives of u by
+    the chain rule, so that the arm rests wherever the box rests.
 
     Args:
         workcell: the description of the cell.

@@ -76,10 +76,10 @@ class Cell:
             workcell: the description of the cell.
             objectives: objectives that searches minimise: names in `OBJECTIVES`, or `Objective`
                 records.
-            threads: number of threads that evaluate candidates, 0 for one per core; the results
-                do not depend on the number. None means one per core, or one in a worker process.
-            compiled: source of the compiled functions, None for the default. An
-                `InterpretedCell` of the workcell is another source.
+            threads: number of threads that evaluate candidates, 0 for one per core; the results do
+                not depend on the number. None means one per core, or one in a worker process.
+            compiled: the functions of the cell. None compiles them, or loads them from the cache;
+                an `InterpretedCell` evaluates them without a compiler.
 
         Raises:
             SettingsError: an objective is unknown, or given twice.
@@ -146,13 +146,14 @@ class Cell:
         return cell
 
     def with_start_branches(self, branches: tuple[int, int]) -> Cell:
-        """Return a cell with other start branches, after reading the workcell file again.
+        """Return a copy of the cell with fixed start branches.
 
         Args:
-            branches: for each arm, index of its start branch, which replaces "search" in the file.
+            branches: for each arm, index of its start branch, in place of "search" in the workcell
+                file.
 
         Raises:
-            WorkcellError: the file was changed and is wrong now.
+            WorkcellError: the workcell is not valid with these branches.
         """
         known = self.workcell
         decided = load(known.source, decided=branches, text=known.text)
@@ -357,8 +358,8 @@ class Cell:
     def random(self, count: int, rng: np.random.Generator) -> Array:
         """Draw random decision vectors (count, n_var).
 
-        The waypoints of the workcell file are drawn uniformly within their bounds. If the cell has
-        further waypoints, these follow from the drawn ones.
+        The waypoints of the workcell file are drawn uniformly within their bounds. If the task
+        inserts further waypoints between them, these are interpolated on the drawn path.
 
         Args:
             count: number of decision vectors.

@@ -350,8 +350,9 @@ def is_interpretable(workcell: Workcell) -> bool:
 
 @lru_cache
 def _expressions(folder: Path) -> str:
-    """Return the digest of the source code of the package `symbolic`, as it was at the first call
-    in this process.
+    """Return the digest of the source code of the package `symbolic`.
+
+    It is computed once per process, so a later change of the files has no effect.
 
     Args:
         folder: folder of the cache of compiled libraries.
@@ -367,8 +368,9 @@ def _parameters(workcell: Workcell) -> WorkcellParameters:
 
 
 def bound_to(function: NumericFunction, numbers: WorkcellParameters) -> NumericFunction:
-    """Return a function whose last inputs, the parameters, are filled in with a cell's parameters,
-    except start postures.
+    """Return a function whose last inputs, the parameters, are filled in with the values of a cell.
+
+    Start postures are not filled in: they remain inputs.
 
     Args:
         function: the function.

@@ -53,15 +53,13 @@ class EvaluatedCandidates:
 def _groups(
     n_var: int, objective_names: tuple[str, ...], reasons: tuple[str, ...] = REASONS
 ) -> dict[str, list[str]]:
-    """Return the names of the columns of numbers in a file of candidates.
+    """Return the names of the columns of a file of candidates that hold numbers, by field of
+    `Evaluations`.
 
     Args:
         n_var: length of the decision vector.
         objective_names: names of the objectives.
         reasons: names of the constraints.
-
-    Returns:
-        For each field of `Evaluations` the names of the columns that hold it.
     """
     return {
         "x": [f"x_{k + 1}" for k in range(n_var)],
@@ -156,13 +154,12 @@ def _text(line: bytes) -> str:
 def _rows(file: gzip.GzipFile, width: int, most: int) -> tuple[Array, NDArray[np.int8]]:
     """Read all rows of a file of candidates.
 
-    Rows are read one by one and at most `most` numbers in all, so a small compressed file cannot
-    expand to a huge amount of memory.
+    Rows are read one by one, so a small compressed file cannot expand to a huge amount of memory.
 
     Args:
         file: the file, after its header.
         width: number of columns.
-        most: largest number of numbers in the file.
+        most: allowed number of numbers in the file; a larger one raises a ValueError.
 
     Returns:
         - Numbers (n, width - 1) of the n candidates.

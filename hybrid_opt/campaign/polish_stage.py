@@ -74,8 +74,8 @@ def polish_stage(
 
     Args:
         settings: settings of the polish.
-        known: function that returns further known paths (m, n_path) for an open results folder;
-            None for no further paths.
+        known: function of the open results folder that returns further paths (m, n_path) from which
+            the polish may start, such as those of another campaign; None for no further paths.
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:

@@ -128,9 +128,9 @@ class CampaignResults:
 
     @property
     def _figures(self) -> dict[str, str]:
-        """Texts by title for the display: number and sizes of the fronts, and the file of the
-        recommended carry if there is one.
-        """
+        """Texts by title for the display. Per algorithm, and per algorithm after the polish, they
+        state the number of fronts and their sizes. The last one is the file of the recommended
+        carry, if there is one."""
         sizes: dict[str, list[int]] = {}
         for front in self.fronts:
             sizes.setdefault(front.title, []).append(len(front))

@@ -34,9 +34,8 @@ SIZE_KEYS = ("population", "swarm", "batch")
 
 
 def sized(algorithm: str, size: int) -> dict[str, Any]:
-    """Return the settings, values by name, with which an algorithm evaluates `size` candidates per
-    generation.
-    """
+    """Return the settings of an algorithm, as values by name, that make it evaluate `size`
+    candidates per generation."""
     known = asdict(metaheuristics.settings_of(algorithm))
     return {key: size for key in SIZE_KEYS if key in known}
 

@@ -75,8 +75,9 @@ class Stage:
 
 
 def run_stages(folder: CampaignFolder, stages: Sequence[Stage], progress: Progress) -> None:
-    """Run the stages of a study that are not done, or whose files are damaged, in order. Once a
-    stage has run, all later stages run as well.
+    """Run the stages of a study in order, except those that are done and have undamaged files.
+
+    Once a stage has run, all later stages run as well.
 
     Args:
         folder: the open results folder.
@@ -156,15 +157,15 @@ one question, which carry to run, and the fronts of its replicas differ by about
 
 
 def drivable_settings(settings: CampaignSettings, replicas: int | None = None) -> CampaignSettings:
-    """Return the settings of the drivable experiment that accompanies another experiment of a
-    study.
+    """Return the settings of a study's drivable experiment, from those of its first experiment.
 
-    They differ from the other experiment's in the number of replicas and in the objectives:
-    durations, and forces of the kind, planned or robust, that the other experiment minimises.
+    They differ in the number of replicas and in the objectives, which are the duration and the peak
+    force. The force is the robust force if the first experiment minimises robust forces, else the
+    planned force.
 
     Args:
-        settings: settings of the other experiment.
-        replicas: number of replicas per algorithm; None for the number of the other experiment, but
+        settings: settings of the first experiment.
+        replicas: number of replicas per algorithm; None for the number of the first experiment, but
             at most `DRIVABLE_REPLICAS`.
 
     Raises:
@@ -177,12 +178,13 @@ def drivable_settings(settings: CampaignSettings, replicas: int | None = None) -
 
 
 def drivable_stage(stages: Sequence[Stage], replicas: int | None = None) -> Stage:
-    """Return the stage of a study that runs the drivable experiment, in the subfolder `drivable/`.
+    """Return the stage of a study that runs the drivable experiment.
 
-    The subfolder contains a complete campaign of the drivable variant of the study's cell.
+    The experiment is a complete campaign of the drivable variant of the study's cell, in the
+    subfolder `drivable/`.
 
     Args:
-        stages: stages of this campaign.
+        stages: stages of the drivable experiment.
         replicas: number of replicas per algorithm; None for the number of the study, but at most
             `DRIVABLE_REPLICAS`.
     """
@@ -295,9 +297,10 @@ def store_results(
     left: Mapping[Path, Argument],
     done: int,
 ) -> None:
-    """Compute missing files of a stage by the workers, and store each as soon as it is computed.
+    """Compute the missing files of a stage, and store each as soon as it is computed.
 
-    If a stage has only one file, this process computes it and shows its progress.
+    The workers of the folder compute the files in parallel. The file of a stage with only one file
+    is computed in this process, which shows the progress within it.
 
     Args:
         folder: the results folder.
@@ -341,12 +344,13 @@ Made = TypeVar("Made")
 
 
 def with_cell(of_workcell: Callable[[Workcell], Made], files: CellFiles) -> Made:
-    """Unpack workcell files to a temporary folder and return the result of a function of the
-    workcell. The folder exists only during the call.
+    """Call a function of a workcell whose files are only in memory, and return its result.
+
+    The files are unpacked to a temporary folder, which exists only during the call.
 
     Args:
         of_workcell: function of the workcell.
-        files: files of the workcell.
+        files: content of the workcell's files.
     """
     with TemporaryDirectory() as folder:
         return of_workcell(unpack_cell(files, Path(folder)))

@@ -341,9 +341,10 @@ class Intervals(Rows):
     pending: NDArray[np.bool_]
 
     def hand_on(self) -> None:
-        """Copy measured distances from the end of an interval to the start of the next interval.
+        """Share measured distances between intervals that meet.
 
-        This is done only if both have the same configuration.
+        If the end of an interval has the same configuration as the start of the next one, the
+        distances measured at the end are copied to this start.
         """
         same = np.all(self.b.configuration[:-1] == self.a.configuration[1:], axis=1)
         before = np.flatnonzero(same)

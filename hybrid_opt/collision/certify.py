@@ -101,16 +101,17 @@ def certify(
     configuration: Configuration,
     parameters: Array,
 ) -> Certificate:
-    """Certify that one path is free of collisions, as `certify_all` does.
+    """Prove that one continuous path is free of collisions, or find where it is not
+    (`certify_all`).
 
     Args:
         checker: collision checker of the workcell.
         configuration: function from path parameters (n,) to box poses (n, 6) and joint positions
             (n, joints) of each arm.
-        parameters: (n,) increasing path parameters of the first grid.
+        parameters: (n,) increasing path parameters at which the refinement begins.
 
     Raises:
-        SettingsError: the path does not become straight on any grid.
+        SettingsError: the path jumps, so that no refinement makes its intervals nearly straight.
     """
 
     def one(_: NDArray[np.intp], u: Array) -> Array:
@@ -139,7 +140,7 @@ def certify_all(
         parameters: for every path the increasing path parameters (n,) of its first grid.
 
     Raises:
-        SettingsError: a path does not become straight on any grid.
+        SettingsError: a path jumps, so that no refinement makes its intervals nearly straight.
     """
     grid = _straight_grid(checker, configurations, parameters)
     clearance = checker.bounds(*checker.split(grid.configuration))
@@ -325,13 +326,15 @@ def configurations(
 
     Args:
         paths: sampled paths of one task.
-        posture: compiled `symbolic.robot.arm.posture_function`.
+        posture: compiled `symbolic.robot.arm.posture_function`, which finds both arms' joint
+            positions at a box pose from nearby ones.
         owner: (n,) index in `paths` of the path to which each path parameter belongs.
         u: (n,) path parameters in [0, 1].
 
     Returns:
         (n, 6 + all joints) box pose [m, rad] and joints of both arms [rad or m]. The joints are NaN
-        where Newton's method, begun between the neighbouring samples, does not reach the box pose.
+        where Newton's method, started between the neighbouring samples, does not reach the box
+        pose.
     """
     basis = path_position(len(paths[0].waypoints), u)
     waypoints = np.array([path.waypoints for path in paths])
@@ -360,7 +363,8 @@ def certificates(
 
     Args:
         checker: collision checker of the workcell.
-        posture: compiled `symbolic.robot.arm.posture_function`.
+        posture: compiled `symbolic.robot.arm.posture_function`, which finds both arms' joint
+            positions at a box pose from nearby ones.
         paths: the sampled path of each carry.
     """
     found: list[Certificate] = []

@@ -139,7 +139,8 @@ class CollisionChecker:
 
     @cached_property
     def tables(self) -> tuple[JointTable, ...]:
-        """Tables of lower bounds of the distances of some pairs of bodies by joint positions."""
+        """For some pairs of bodies, a table of lower bounds of their distance over the positions of
+        two joints."""
         return joint_tables(self.geometry)
 
     def check(self, pose: Array, q_1: Array, q_2: Array, clearance: Array | None = None) -> Verdict:
@@ -344,13 +345,19 @@ class CollisionChecker:
         pairs: NDArray[np.intp],
         resting: NDArray[np.bool_],
     ) -> NDArray[np.bool_]:
-        """Decide which pairs collide, (m,), by proof, and by FCL where no proof succeeds.
+        """Decide for m queries, each of one pair of bodies at one sample, whether the pair
+        collides.
+
+        Bounds of the distance decide where they suffice, else the library FCL.
 
         Args:
-            placed: outputs of the function `piece_poses`.
+            placed: outputs of the function `piece_poses`, the poses of all convex solids.
             rows: (m,) index of the sample of each query.
             pairs: (m,) index of the checked pair of each query.
             resting: (m,) True where the payload may rest on the body.
+
+        Returns:
+            (m,) True for pairs that collide.
         """
         first, second = self._bodies(pairs, resting)
         # A resting payload may come nearer than the tolerance; it only must not intersect.

@@ -82,12 +82,15 @@ class JointTable:
 
 
 def joint_tables(geometry: CellGeometry) -> tuple[JointTable, ...]:
-    """Build tables of lower bounds of distances for pairs of bodies that compiled bounds often
-    cannot decide.
+    """Build tables of lower bounds of distances, over the positions of two joints, for pairs of
+    bodies that the compiled bounds often cannot decide.
 
-    A pair gets a table if all of three conditions hold. Exactly two joints lie between its bodies,
-    both revolute joints of one arm. One of the bodies has a convex hull. The bodies are close in
-    many postures, or the body nearer to the base carries the whole arm.
+    A pair gets a table if all of these hold:
+
+    - Exactly two joints lie between its bodies, both revolute joints of one arm.
+    - One of the bodies has a convex hull.
+    - Simple covers of the bodies overlap in many postures, or the arm is mounted on the body that
+      is nearer to its base.
     """
     close, found = close_pairs(geometry), []
     for k, pair in enumerate(geometry.active):
@@ -107,11 +110,11 @@ def joint_tables(geometry: CellGeometry) -> tuple[JointTable, ...]:
 
 
 def _in_root(body: CollisionBody, arm: ArmGeometry) -> tuple[Piece, ...]:
-    """Return the pieces (convex solids) of a body in a frame of the arm, so that they do not depend
-    on where the arm stands.
+    """Return the pieces (convex solids) of a body in a frame that belongs to an arm.
 
-    This is the link's frame for a moving link, and the frame of the arm's root for a fixed body.
-    The poses of a fixed body's pieces are rounded.
+    Pieces of a link stay in the frame of the link. Pieces of a fixed body are converted from the
+    world frame to the frame of the arm's root, and their poses are rounded. The result, and tables
+    that are cached under it, are thus the same wherever the arm stands.
 
     Args:
         body: the body.

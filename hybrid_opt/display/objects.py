@@ -38,9 +38,8 @@ share."""
 
 
 def text_of(shown: object) -> str:
-    """Format an object of this library as text: a heading, then one line per number that describes
-    it.
-    """
+    """Format a result object (a carry, a timing, a front, ...) as text: a heading, then one line
+    per number that describes it."""
     return "\n".join([heading_of(shown), *lines(figures_of(shown))])
 
 

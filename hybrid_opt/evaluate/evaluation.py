@@ -410,7 +410,7 @@ class CandidateEvaluator:
         Args:
             x: (n, n_var) decision vectors.
             sampled: violations and collisions on the samples.
-            described: per-sample outputs that the objectives need, by name.
+            described: per-sample outputs by name, at least those that the objectives read.
         """
         values = np.column_stack(
             [objective.evaluate(described, self.workcell) for objective in self.objectives]

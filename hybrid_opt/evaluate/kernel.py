@@ -176,14 +176,15 @@ class Kernel:
 
         Args:
             x: (n, n_var) decision vectors.
-            wanted: names in `sample_sizes` of the outputs to be returned per sample.
+            wanted: names of the outputs to be returned per sample, all of them in `sample_sizes`.
             with_collisions: False to skip the collision check.
             threads: number of threads; 0 for one per core. The results do not depend on it. FCL
                 runs in the calling thread.
             begin: (joints of both arms,) joint positions that hold the box at the start [rad]; None
                 for the cell's start branches.
-            all_forces: matters if an optimisation computes the contact forces. False leaves the
-                forces of candidates that violate another constraint at zero.
+            all_forces: has an effect only in cells whose contact forces are computed by an
+                optimisation. True computes the forces of all candidates. False leaves them at zero
+                for candidates that violate another constraint.
 
         Raises:
             CodegenError: memory is short.
@@ -343,11 +344,12 @@ def load_kernel(
 
 
 def _same(found: SampledVerdicts, expected: SampledVerdicts) -> bool:
-    """Return True if two evaluations agree to the last bit.
+    """Return True if two evaluations have the same first violations, collisions and outputs, to the
+    last bit.
 
     Args:
-        found: an evaluation, whose outputs are all compared.
-        expected: the other evaluation.
+        found: an evaluation. Only outputs that it contains are compared.
+        expected: the other evaluation, with at least these outputs.
     """
     pairs = [(values, expected.outputs[name]) for name, values in found.outputs.items()]
     pairs += [

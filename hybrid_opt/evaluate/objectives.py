@@ -188,8 +188,8 @@ def _joint_length(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute for n candidates the largest used share of the friction if both arms hold with their
-    reference forces, (n,).
+    """Compute for n candidates the largest share (n,) of the available friction that the carry
+    uses, if both arms press with their reference forces.
 
     Args:
         outputs: outputs of the evaluator by name.
