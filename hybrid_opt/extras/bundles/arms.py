@@ -60,12 +60,20 @@ def require_arms(
     has_address: bool = False,
     any_arm: bool = False,
 ) -> None:
-    """Check that both arms are of the maker of a target and have the joints and addresses that the
-    target needs. With `any_arm` the maker does not matter.
+    """Check that both arms fit a target: their maker, their joints and, if asked, their addresses.
+
+    Args:
+        workcell: the cell.
+        target: name of the target, for messages.
+        maker: maker of the arms that the target supports.
+        axes: allowed numbers of revolute joints per arm.
+        has_address: True if the workcell has to state the address of each arm's controller.
+        any_arm: True to accept arms of any maker.
 
     Raises:
-        SettingsError: the file, name, xacro arguments or links of an arm name another maker; an arm
-            has another number of joints or a sliding joint; or a driver has no address.
+        SettingsError: no name in an arm's description (file, robot, links, xacro arguments)
+            indicates the maker; an arm has another number of joints or a sliding joint; or an
+            address is missing.
     """
     for robot in workcell.robots:
         if not any_arm and not _SIGNS[maker].search(described(robot)):
@@ -114,8 +122,12 @@ class Lines:
     meaning: str
 
     def require(self, workcell: Workcell, target: str) -> None:
-        """Check that a target can reach the hands of a cell by the names of their outputs and,
-        where stated, of their inputs.
+        """Check that the names of the outputs that switch a cell's hands, and of the inputs that
+        report their state, are names that a target allows. Inputs may be missing.
+
+        Args:
+            workcell: the cell.
+            target: name of the target, for messages.
 
         Raises:
             SettingsError: a name is not allowed; the message states the key and the allowed names.
@@ -216,8 +228,9 @@ def comment(text: str) -> str:
 
 
 def prefixes(workcell: Workcell) -> tuple[str, str]:
-    """Return the prefix of the links' and joints' names in ROS, of each robot; '' for both if the
-    robots are arms of one machine.
+    """Return for each robot the prefix of its links and joints in ROS.
+
+    Both are '' if the robots are arms of one machine.
 
     Raises:
         SettingsError: the prefixes in the file would give joints of both arms the same names.
@@ -254,8 +267,13 @@ def pad_frame(prefix: str, arm: int) -> str:
 
 
 def description(workcell: Workcell, q: Array) -> str:
-    """Return the URDF of the cell with both arms, as text, with their joint positions q (joints,)
-    in a simulator at its start, side by side [rad or m]."""
+    """Return the text of a URDF of the whole cell: both arms, tools, pads and environment.
+
+    Args:
+        workcell: the cell.
+        q: (joints,) joint positions of both arms side by side, at which a simulator starts [rad or
+            m].
+    """
     root = ElementTree.Element("robot", {"name": "cell"})
     ElementTree.SubElement(root, "link", {"name": WORLD})
     shared = one_machine(workcell.robots)
@@ -327,7 +345,8 @@ def _hold(joint: ElementTree.Element, position: float) -> None:
 
 
 def _add_fixed(root: ElementTree.Element, parent: str, name: str, bodies: Sequence[Body]) -> None:
-    """Add a link with bodies to a URDF, with the frame of its parent link."""
+    """Add a link `name` with some bodies to a URDF, fixed to the link `parent` and with the same
+    frame."""
     _joint(root, f"{name}_fixed", parent, name, np.eye(4))
     link = ElementTree.SubElement(root, "link", {"name": name})
     for body in bodies:

@@ -133,8 +133,16 @@ def manifest(
     export: Export, name: str, target: Target, origin: Origin, skew: float | None
 ) -> dict[str, Any]:
     """Return the manifest of a target's bundle as JSON values: content, origin of the trajectory,
-    and limits. `skew` is the delay between the starts of both arms that the job has to tolerate
-    [s]; None if not checked."""
+    and limits.
+
+    Args:
+        export: the job with the data of its files.
+        name: name of the target.
+        target: the target.
+        origin: origin of the carry.
+        skew: delay between the starts of both arms that the job has to tolerate [s]; None if this
+            is not checked.
+    """
     job, k = export.job, export.stiffness
     is_lost = bool(target.reaction and export.partner_stop.warning)
     step: dict[str, Any] = {"step": export.step}
@@ -344,10 +352,11 @@ def export(
         The files written, the manifest first.
 
     Raises:
-        SettingsError: the target is unknown or not for these arms, the step is out of range or too
-            long for the forces, or the timing failed.
-        JobError: the job cannot be planned, or friction would not hold the box in a stop or with
-            the skew.
+        SettingsError: the target is unknown or not for these arms; the time step is out of range,
+            or so long that normal forces between samples differ too much from the commanded ones;
+            or the timing failed.
+        JobError: the job cannot be planned; or friction would not hold the box during a stop, or if
+            one arm starts later than the other by the skew.
         ResultsError: the bundle cannot be written, or its folder contains something else.
     """
     options, origin = options or BundleOptions(), origin or Origin()
@@ -372,14 +381,21 @@ def export(
 
 
 def prepared(job: Job, name: str, options: BundleOptions) -> Export:
-    """Sample a job for a bundle at even time steps: the requested one, or the longest of the target
-    for which the pads' forces between samples are near enough to the commanded ones.
+    """Sample a job for a bundle at even time steps, and find its shortest stop.
+
+    The step is the requested one. Without a request it is the target's longest step with which the
+    normal forces between samples stay close to the commanded ones.
+
+    Args:
+        job: the job.
+        name: name of the target.
+        options: options of the bundle, with the requested step and stiffness.
 
     Raises:
         SettingsError: the step is out of range, no step keeps the force error small enough, or the
             target needs a stiffness that is unknown.
-        JobError: stops of every tried duration need more than the commanded forces somewhere on
-            the path.
+        JobError: stops of every tried duration need more than the commanded forces somewhere on the
+            path.
     """
     target, step, k = target_for(name, job.workcell), options.step, options.stiffness
     k = target.stiffness_of(job, name) if k is None else k

@@ -125,8 +125,8 @@ def _messages(export: Export, types: Mapping[str, Any]) -> Iterator[tuple[int, s
         return types[f"{package}/msg/{name}"](*values)
 
     def frames(k: int) -> Iterator[tuple[str, Array]]:
-        """Yield the name of each frame and its pose (4, 4) in the world: the box, every link of
-        both arms, and both pads."""
+        """Yield the name of each frame and its pose (4, 4) in the world at sample k: the box, every
+        link of both arms, and both pads."""
         yield "box", boxes[k]
         for arm, robot in enumerate(cell.robots):
             model, found, prefix = models[arm], data[arm], joined[arm]

@@ -85,11 +85,17 @@ class Gap:
 def chosen_step(
     job: Job, steps: Sequence[float], interpolation: Interpolation, stiffness: float
 ) -> float:
-    """Return the longest time step [s] with which the normal forces stay near the commanded ones
-    between samples.
+    """Return the longest time step [s] with which the normal forces between samples stay close to
+    the commanded ones.
 
     Between two samples the distance of the pads changes, and with it the normal forces. A step is
     accepted if this error is at most the share `TRACKED` of the least commanded force.
+
+    Args:
+        job: the job.
+        steps: steps to choose from, the longest first [s].
+        interpolation: how the controller interpolates between samples.
+        stiffness: stiffness of each arm at its pad along the normal [N/m].
 
     Raises:
         SettingsError: the error is too large with every step.
@@ -108,7 +114,14 @@ def chosen_step(
 
 
 def gap_of(sampled: SampledJob, interpolation: Interpolation, stiffness: float) -> Gap:
-    """Compute how far the pads deviate from their planned poses between the samples of a job."""
+    """Compute how far the pads deviate from their planned relative position between the samples of
+    a job, while they hold the box, and the force error that follows.
+
+    Args:
+        sampled: the job at the time steps of a target.
+        interpolation: how the controller interpolates between samples.
+        stiffness: stiffness of each arm at its pad along the normal [N/m].
+    """
     job, time = sampled.job, sampled.time
     spans = [sampled.span(job.phases.index(phase)) for phase in job.held]
     starts = np.concatenate([np.arange(span.start, span.stop - 1) for span in spans])

@@ -84,9 +84,8 @@ class Measured:
 
 
 def unloaded(job: Job) -> Job:
-    """Return a copy of a job for a run without a box: without contact forces, with hands that stay
-    off, and with wider limits on delays.
-    """
+    """Return a copy of a job for a run without a box: the arms exert no contact forces, hands stay
+    off, and the limits on delays are wider."""
     robots = []
     for robot in job.robots:
         contact = robot["hold_effort_without_gravity"]
@@ -166,10 +165,13 @@ class Looks:
     def note(
         self, now: float, machine: Machine, seen: Seen, raw: list[float | None], way: float = nan
     ) -> None:
-        """Store a measurement of the time `now` [s], if the job runs at a constant rate.
+        """Store the measurements of one time. Nothing is stored unless the job runs at a constant
+        rate.
 
         Args:
+            now: time of the measurements, on the clock of the program [s].
             machine: state machine of the job, with the commanded point on the path.
+            seen: measured state of both arms.
             raw: reading of each arm's force sensor [N]; None without a sensor.
             way: distance of the pressing pad beyond its planned position [m]; NaN if unknown.
         """
@@ -219,12 +221,16 @@ class Looks:
         return median(found) if found else nan
 
     def contact(self, arm: int, lag: float) -> dict[str, float]:
-        """Evaluate the readings of an arm's force sensor while a block was pressed. `lag` is the
-        arm's delay behind its commands [s].
+        """Evaluate the readings of an arm's force sensor while a block was pressed.
+
+        Args:
+            arm: index of the arm.
+            lag: delay of the arm behind its commands [s].
 
         Returns:
-            Values of `Measured` by name: `sign`; and `stiffness` if the displacement of the pad is
-            known, else `press`.
+            Values of `Measured` by name: `sign`, the sign of the sensor's reading; and `stiffness`
+            of the arm if the displacement of the pad is known, else `press`, the ratio of measured
+            to commanded force.
 
         Raises:
             Refused: no force was measured.
@@ -268,8 +274,9 @@ def bring_up(
         folder: folder of the bundle.
         job: the job.
         plan: planned values, as `plan` in the bundle's configuration.
-        drive: function that takes a job and a word, runs the job to its end and back when somebody
-            says the word, and stores measurements in `looks`. It returns True if this is done.
+        drive: function of a job and a word. It waits until the operator enters the word (without
+            waiting for ''), runs the job to its end and back, and stores measurements in `looks`.
+            It returns True if the run was completed.
         looks: store of the measurements.
 
     Raises:

@@ -131,8 +131,9 @@ class Job:
         return next((first for first, (_, phase) in firsts if phase == name), self.end)
 
     def is_touching(self, s: float) -> bool:
-        """Return True if the box may already stand on its support although the set-down is not
-        finished: its planned position is at most `TOUCH` from the end of the set-down."""
+        """Return True if the box may already stand on its support at a planned time s [s] within
+        the set-down: its planned position is at most `TOUCH` from the one at the end of the
+        set-down."""
         if self.phase(s) != "set_down" or self.is_standing:
             return False
         places, (k, x, _) = self.document["box"]["pose"], self._place(s)
@@ -141,11 +142,12 @@ class Job:
         return math.dist(last, list(here)[:3]) <= TOUCH
 
     def stand(self, s: float, q: Sequence[Sequence[float] | None]) -> None:
-        """Let the release begin at a point within the set-down, because the box stands already.
+        """Skip the rest of the set-down, because the box already stands on its support.
 
-        From the release on, planned positions are shifted by the part of the set-down that is left
-        out. While the commanded forces decrease, the positions move to the measured ones: the box
-        displaces compliant arms from their commanded positions, which would go on pressing it.
+        From the release on, planned positions are shifted by the motion that is left out. While the
+        commanded forces decrease, the commanded positions move to the measured ones. Otherwise
+        compliant arms, which the box holds away from their commanded positions, would go on
+        pressing it.
 
         Args:
             s: planned time, within the set-down, at which the box stands [s].
@@ -175,7 +177,10 @@ class Job:
         return self._phases[0][0] < s <= self.pressed
 
     def grips(self, s: float, direction: float) -> bool:
-        """Return True if hands are to be switched on at a point of the path.
+        """Return True if hands are commanded to hold at a point of the path.
+
+        Hands are switched at the beginning of a phase. On the way back a switch is reversed at the
+        end of its phase.
 
         Args:
             s: planned time of the point [s].
@@ -189,8 +194,8 @@ class Job:
         return passed[-1] if passed else False
 
     def holds(self, s: float) -> bool:
-        """Return True if hands have to hold the box at a planned time s [s], whether the job runs
-        forward or back."""
+        """Return True if hands are commanded to hold at a planned time s [s] in both directions of
+        the job. Only there they have to report that they hold."""
         return self.grips(s, 1.0) and self.grips(s, -1.0)
 
     def _place(self, s: float) -> tuple[int, float, float]:
@@ -201,8 +206,8 @@ class Job:
         return k, min(max((s - self.time[k]) / step, 0.0), 1.0), step
 
     def position(self, arm: int, s: float) -> list[float]:
-        """Interpolate the planned joint positions of an arm by cubic polynomials [rad, or m for
-        sliding joints]."""
+        """Interpolate the planned joint positions of an arm at a planned time s [s] by cubic
+        polynomials [rad, or m for sliding joints]."""
         k, x, step = self._place(s)
         q, v = self.robots[arm]["position"], self.robots[arm]["velocity"]
         a, b = (1.0 + 2.0 * x) * (1.0 - x) ** 2, x * (1.0 - x) ** 2 * step
@@ -227,7 +232,7 @@ class Job:
         return [(1.0 - x) * a + x * b for a, b in zip(rows[k], rows[k + 1], strict=True)]
 
     def force(self, arm: int, s: float) -> float:
-        """Return the commanded normal force of an arm [N]."""
+        """Return the commanded normal force [N] of an arm at a planned time s [s]."""
         k, x, _ = self._place(s)
         rows = self.robots[arm]["normal_force"]
         return float((1.0 - x) * rows[k] + x * rows[k + 1])
@@ -255,7 +260,8 @@ class Job:
         return float(sum(r * abs(a - b) for r, a, b in zip(reach, q, planned, strict=True)))
 
     def speed(self, arm: int, s: float) -> float:
-        """Return an upper bound of the planned speed of an arm's pad [m/s]."""
+        """Return an upper bound of the planned speed [m/s] of an arm's pad at a planned time s
+        [s]."""
         rates = self.linear(arm, "velocity", s)
         reach = self.robots[arm]["reach"]
         return float(sum(r * abs(v) for r, v in zip(reach, rates, strict=True)))

@@ -129,8 +129,13 @@ class Clock:
         return sign * 30.0 * x * x * (1.0 - x) ** 2 / self._takes
 
     def ahead(self, rate: float, step: float) -> Iterator[Moment]:
-        """Yield the states from now on if the rate changes to a given one, until the commanded
-        point moves no more."""
+        """Yield the future states of the path if the rate begins to change now, until the commanded
+        point comes to rest.
+
+        Args:
+            rate: rate after the change: 1 for the planned speed, 0 for rest, -1 for backwards.
+            step: time between two states [s].
+        """
         clock = copy(self)
         clock.turn(rate)
         yield Moment(0.0, clock.s, clock.rate, clock.change)
@@ -190,9 +195,10 @@ class Machine:
         """Begin at the start of the job, at rest.
 
         Args:
+            job: the job.
             lag: delay of both arms behind their commands [s].
-            lead: time between the decision to stop and the first changed command [s].
-            sensors: for each arm, True if its force must be measured.
+            lead: time between the decision to stop and the first command that is changed by it [s].
+            sensors: for each arm, True if the job needs the reading of its force sensor.
             inputs: for each arm, True if an input must report whether its hands hold.
         """
         self.job, self.lag, self.lead, self._sensors = job, lag, lead, sensors
@@ -217,8 +223,9 @@ class Machine:
         """Check that both arms are ready for the job.
 
         Raises:
-            Refused: a stop is requested, an arm is silent or not at its first position, a sensor
-                gives no reading, or a pad is pressed.
+            Refused: a stop is requested, an arm is silent or not at its first position, a required
+                sensor gives no reading, an input does not report open hands, or a sensor already
+                shows a force.
         """
         if seen.fault:
             raise Refused(seen.fault)
@@ -267,8 +274,12 @@ class Machine:
         return self.job.grips(self.clock.s, self._direction)
 
     def _aim(self, direction: float) -> None:
-        """List the points of the path ahead at which the clock has to wait until inputs report the
-        state of hands, and limit the clock to the first. `direction` is 1 forward, -1 back.
+        """List the points of the path ahead at which hands are switched, and let the clock run to
+        the first of them. There it waits until inputs report the new state; cells without such
+        inputs have no such points.
+
+        Args:
+            direction: 1 if the job runs forward, -1 if it runs back.
         """
         self._direction, s, found = direction, self.clock.s, self.job.switches
         gates = [switch.end for switch in found if switch.end >= s]
@@ -278,9 +289,8 @@ class Machine:
         self._next_gate()
 
     def _next_gate(self) -> None:
-        """Let the clock run to the next point of the path at which it has to wait for a switch of
-        hands.
-        """
+        """Let the clock run to the next point at which it has to wait until hands are switched;
+        without one, to the end of the path."""
         self._waited = 0.0
         low, high = 0.0, self.job.end
         if self._gates and self._direction > 0.0:
@@ -306,7 +316,12 @@ class Machine:
 
     def tick(self, dt: float, seen: Seen) -> None:
         """Advance the job by one time step. Stop or hold it if the measured state of the arms
-        requires it."""
+        requires it.
+
+        Args:
+            dt: time since the last call [s].
+            seen: measured state of both arms.
+        """
         self.clock.advance(dt)
         self.opened = False
         limit = self.job.limits.silence
@@ -341,8 +356,14 @@ class Machine:
                 self.hold(str(error))
 
     def _lands(self, force: str) -> bool:
-        """Begin to stop the arms if a wrong force may mean that the box stands on its support. No
-        stop begins if the release would begin before the arms are at rest.
+        """Interpret a wrong force near the end of the set-down as contact of the box with its
+        support.
+
+        The arms then begin to stop, and the release begins where they come to rest. They continue
+        as planned if the planned release comes first.
+
+        Args:
+            force: description of the wrong force, the reason of the stop.
 
         Returns:
             True if the box may stand, whether or not a stop begins.
@@ -358,8 +379,12 @@ class Machine:
         return True
 
     def stop(self, reason: str, quick: bool = False) -> None:
-        """Stop along the path and hold the posture there; a quick stop is for an arm that does not
-        follow its commands."""
+        """Stop along the path and hold the posture there.
+
+        Args:
+            reason: reason of the stop.
+            quick: True to stop in the shorter of the two stop times of the job.
+        """
         if self.state == "running":
             self.state, self.reason = "stopping", reason
             limits = self.job.limits
