@@ -265,9 +265,8 @@ def _add_options(parser: Parser) -> None:
 
 
 def complete(options: argparse.Namespace, name: str) -> None:
-    """Set the results folder to `results/NAME` unless the options state one; check the extras.
-
-    The extras that the options need have to be installed.
+    """Set the results folder to `results/NAME` unless the options state one, and check that the
+    extras which the options need are installed.
 
     Args:
         options: parsed command line, which is changed.

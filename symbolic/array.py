@@ -43,9 +43,9 @@ class Range:
         return f"{self.low:g} to {self.high:g} {self.unit}".rstrip()
 
     def suspicion(self, value: float) -> str:
-        """Return text for a message if a value was probably written in another unit: the unit, and
-        the value converted to `unit`. Return '' if none of the units `mistaken` brings the value
-        into the range."""
+        """Return text for a message if a value outside the range lies inside after conversion from
+        one of the units `mistaken`: this unit, and the converted value. Return '' otherwise.
+        """
         for name, factor in self.mistaken:
             if math.isfinite(value) and value != 0 and self.contains(value * factor):
                 return (

@@ -42,7 +42,7 @@ class CellBodies:
 
     @cached_property
     def screen(self) -> Screen:
-        """Parameters of the formulas for lower bounds of the bodies' distances."""
+        """Numbers of the cell's bodies in the formulas for lower bounds of their distances."""
         return screen_of(self.geometry)
 
     @cached_property
@@ -77,9 +77,9 @@ def build_cell_bodies(workcell: Workcell, known: CellBodies | None = None) -> Ce
 
     Args:
         workcell: description of the cell.
-        known: arms and bodies of a cell that differs only in the path, or in how the pads hold the
-            box. Its functions are reused if both cells check the same pairs of bodies. None for no
-            such cell.
+        known: arms and bodies of another cell that differs only in the path or in how the pads hold
+            the box; None without one. Its distance functions are reused if both cells check the
+            same pairs of bodies.
 
     Raises:
         RobotModelError: a URDF does not describe a usable arm.
@@ -177,12 +177,11 @@ def own_pairs(geometry: CellGeometry, arm: int) -> list[int]:
 
 
 def own_clearance(geometry: CellGeometry, arm: int, bounds: Bounds) -> Clearance:
-    """Return a function that bounds how close one arm comes to any body except those of the other
-    arm.
+    """Return a function that computes a lower bound of the distance between one arm and all bodies
+    except those of the other arm.
 
     The function takes box poses (n, 6) and the arm's joint positions (n, joints) at n samples. It
-    returns the smallest lower bound of a distance over all samples [m]; infinity if no pairs are
-    checked.
+    returns the smallest bound over all samples [m]; infinity if no pairs are checked.
 
     Args:
         geometry: the collision bodies and pairs.

@@ -89,12 +89,12 @@ BANDS: dict[tuple[str, int], Band] = {
 def judge(
     ours: Summary, reference: float, *, higher_is_better: bool, std: float | None = None
 ) -> Verdict | None:
-    """Compare the mean of a figure of this project with the mean of a published band.
+    """Compare the mean of an indicator over this project's runs with a published mean.
 
     Args:
-        ours: summary of this project's figure over seeds.
+        ours: mean, standard deviation and number of this project's values, one per seed.
         reference: published mean.
-        higher_is_better: True if a larger figure is better, as for the hypervolume.
+        higher_is_better: True if a larger value is better, as for the hypervolume.
         std: published standard deviation; None to use the standard deviation of `ours`.
 
     Returns:
@@ -234,9 +234,10 @@ def compare(
     population: int = BAND_POPULATION,
     progress: bool = False,
 ) -> AlgorithmTest:
-    """Run every algorithm on every problem with every budget and seeds 0, 1, ...
+    """Run every algorithm on every problem with every budget and the seeds 0, 1, ...
 
-    The problem with its optimum inside the bounds has its own budget and population.
+    The problem `SHIFTED`, whose optimum lies inside the bounds, is run once per algorithm with its
+    own budget and population in place of the given ones.
 
     Args:
         problems: names of the problems.
@@ -299,7 +300,7 @@ def _tests(shifted: dict[str, list[_AlgorithmRun]]) -> tuple[RankTest, ...]:
 
 
 def table(result: AlgorithmTest) -> str:
-    """Return the comparison as text."""
+    """Return the results of `compare` as text, with their comparison with published values."""
     lines = [
         f"Mean over {result.seeds} seeds of the final front (limited size) and of all evaluated "
         "points",

@@ -81,7 +81,8 @@ def _workcell(path: Path | None) -> Workcell:
 def benchmark(
     workcell: Workcell, candidates: int = 10, repeats: int = 3, seed: int = 0
 ) -> dict[str, Any]:
-    """Measure the evaluation of one cell at random decision vectors, in several rounds.
+    """Measure how long the evaluation of a cell's candidates takes: compiled, interpreted and in
+    plain Python, at random decision vectors.
 
     Args:
         workcell: the cell.
@@ -187,18 +188,19 @@ def _costs(
     seed: int,
     what: str,
 ) -> dict[int, Array]:
-    """Measure the time per candidate of the compiled evaluator of several tasks, in turns.
+    """Measure the time per candidate of the compiled evaluator for several sizes of a task, in
+    turns.
 
     Args:
         model: model of the cell, whose task is replaced.
-        tasks: tasks by the number that distinguishes them.
+        tasks: the tasks by their size, such as the number of samples.
         candidates: number of candidates.
         repeats: number of rounds.
         seed: seed of the candidates.
-        what: name of this number, for messages, such as 'samples'.
+        what: what the size counts, for messages, such as 'samples'.
 
     Returns:
-        Times (rounds,) [s] of each task, by its number.
+        Times (rounds,) [s] for each size.
     """
     ways: dict[str, Evaluate] = {}
     x: dict[str, Array] = {}

@@ -112,8 +112,9 @@ def needed_force(carry: Carry) -> float:
 
 
 def rims_share(carry: Carry) -> float:
-    """Compute the share of the needed holding force with which no rim lifts off, if nothing can
-    slide."""
+    """Compute the holding force that keeps all rims from lifting off, over the force that the carry
+    needs. The difference to 1 is due to sliding.
+    """
     first, second = (_rough(contact) for contact in carry.workcell.contacts)
     rough = replace(carry, workcell=replace(carry.workcell, contacts=(first, second)))
     return needed_force(rough) / needed_force(carry)
@@ -127,8 +128,8 @@ def _rough(contact: Contact) -> Contact:
 def threshold(kind: str, carry: Carry) -> HandThreshold:
     """Find the least holding force with which a carry succeeds in the simulator.
 
-    The search starts where the contact model expects the threshold, and is repeated in a wide range
-    if the threshold is not there.
+    A bisection first searches near the force that the contact model requires. If the threshold is
+    not there, it searches the wide range from `LOW` to `HIGH` times this force.
 
     Args:
         kind: kind of the hands, stored in the result.
@@ -283,7 +284,9 @@ def _axes(normal: Array) -> Array:
 
 
 def summary(found: Sequence[HandThreshold]) -> str:
-    """Return one line of text about the ratios of all carries."""
+    """Return one line of text on how the least holding forces in the simulator compare with those
+    of the contact model: the range and the median of their ratios.
+    """
     ratios = np.array([one.ratio for one in found])
     return (
         f"{len(found)} carries: ratio {ratios.min():.3f} to {ratios.max():.3f}, median "

@@ -122,7 +122,8 @@ class LoggedCarry:
 
 
 def labelled(folder: Path) -> list[Path]:
-    """Return the paths of the logs with a label, one per run.
+    """Return the paths of the logs of all labelled runs. For a run with one log per arm it is the
+    log of the left arm.
 
     Args:
         folder: folder of the downloaded data set.
@@ -138,7 +139,7 @@ def labelled(folder: Path) -> list[Path]:
 
 
 def read(path: Path) -> LoggedCarry:
-    """Read a run, from its only file or from the file of the left arm."""
+    """Read a run from its log. If each arm has a log, `path` is that of the left arm."""
     stamp = re.search(r"\d{8}-\d{6}", path.stem)
     mass = re.search(r"_([\d.]+)kg", path.stem)
     slip = SLIPS.get(stamp[0] if stamp else "")
@@ -293,7 +294,9 @@ class Comparison:
 
     @property
     def margin(self) -> Array:
-        """(n,) measured over required normal force, for the lower friction coefficient."""
+        """(n,) ratio of the measured normal force to the one that the model requires with the lower
+        of the two friction coefficients.
+        """
         return np.asarray(self.squeeze / self.need[:, 0])
 
 
@@ -381,8 +384,9 @@ CREPT = 0.025
 def table(folder: Path) -> Table:
     """Return a table with a row for every labelled run.
 
-    A row states the forces at the sample with the least margin, or when the box was lost, and the
-    largest friction used, slide and tilt until then.
+    For a run in which the box was lost, the row states the forces just before; for other runs,
+    those at the sample with the smallest ratio of measured to required force. It also states the
+    largest friction used, slide and tilt of the run.
 
     Raises:
         SettingsError: there are no logs.

@@ -71,7 +71,9 @@ def controls(
         progress: receives messages on the progress.
 
     Returns:
-        One comparison per budget, algorithm and rival.
+        For each budget and algorithm of the study, a comparison of its polished fronts with a
+        longer search of the same algorithm, and one with a longer search of NSGA-II if the study
+        has it.
 
     Raises:
         ResultsError: the study is not complete, or was not polished.

@@ -125,8 +125,11 @@ class Slips:
 
 
 def thresholds(options: argparse.Namespace) -> int:
-    """Find, print and store the threshold of every carry that the options request. Return the exit
-    code."""
+    """Find for every requested carry the least multiple of its planned force that holds the box in
+    the simulator. Print and store the results, and return the exit code.
+
+    Results in an existing file are kept, and the work goes on behind them.
+    """
     path, done = options.output, Slips(options.seed, options.layer, ())
     if path.exists():
         done = read_record(Slips, path, "delete it to begin anew")
@@ -154,7 +157,9 @@ def thresholds(options: argparse.Namespace) -> int:
 
 
 def summary(found: Sequence[Slip]) -> str:
-    """Return lines of text on how many carries have a threshold near 1, and slip where planned."""
+    """Return lines of text on how many carries are held by about the planned force, and how many
+    slip first at about the time at which the planned force is largest.
+    """
     lines = []
     for pads, allowed in ALLOWED.items():
         some = np.array([slip.threshold for slip in found if slip.pads == pads])

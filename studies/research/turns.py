@@ -178,7 +178,8 @@ def with_collisions(
         seed: seed of the search and the draws.
 
     Returns:
-        The figures of candidates from a search and, under the key 'random', of uniform candidates.
+        Times and shares by name for candidates that a search evaluates; and, under the key
+        'random', the same for candidates that are uniform within the bounds.
     """
     rng = np.random.default_rng(seed)
     progress(f"a search of {TURN_EVALUATIONS} evaluations, whose candidates are to be timed")

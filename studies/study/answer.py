@@ -94,7 +94,7 @@ def carry_text(duration: float, force: float, job_duration: float, order: str) -
 
 
 def job_text(job: Job) -> str:
-    """Return the carry within a planned job in one line of text."""
+    """Return durations and commanded force of a planned job in one line of text."""
     carried, squeeze = job.phase("carry").duration, job.squeeze
     return carry_text(carried, squeeze.force, job.duration, squeeze.order)
 
@@ -232,12 +232,12 @@ def _rival(rival: Alternative, found: StoredRecommendation) -> str:
 def _checked(price: RobustPrice) -> str:
     """Return a phrase on the robustness of the recommended carry.
 
-    It says how many random cases of the uncertainty slip, which uncertainty this is, the largest
-    force of the position-controlled arm, and which multiple of the uncertainty the reference forces
-    would still hold.
+    It states how many random cases of the uncertainty slip, and of which uncertainty; the largest
+    force of the position-controlled arm; and the largest factor on the uncertainty at which the
+    needed forces still are within the reference forces.
 
     Args:
-        price: robust forces of the carry, by multiple of the uncertainty.
+        price: robust forces of the carry, by factor on the uncertainty.
     """
     slips = "slips" if price.check.failing == 1 else "slip"
     return (
@@ -252,8 +252,9 @@ def _percent(ratio: float) -> str:
 
 
 def _margins(found: StoredRecommendation) -> list[str]:
-    """Return phrases that say how far the description may be off until the commanded force is too
-    small: the missing share of this force, and the error of the centre of mass along each axis."""
+    """Return phrases on two errors up to which the commanded force still holds the box: the share
+    of this force that may be missing, and the offset of the centre of mass along each axis.
+    """
     texts = [
         f"up to {100.0 * margin.limit:.0f} % of it may be missing"
         for margin in found.margins

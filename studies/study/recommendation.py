@@ -420,7 +420,7 @@ def known_paths(root: Path, task: Task) -> Array:
 
 
 def least_force(campaign: CampaignResults, task: Task) -> dict[str, Array]:
-    """Find the balanced path of all fronts of an experiment.
+    """Find the path of least forces of an experiment: the balanced path of all its fronts together.
 
     Args:
         campaign: results of the experiment.

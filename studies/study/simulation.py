@@ -278,8 +278,9 @@ def _simulated_hands(
 ) -> StoredSimulation:
     """Simulate a carry in hands without arms, and return the record to store.
 
-    The least factor of the planned forces that holds the payload is found. The stored simulation
-    has the forces that hold the box in every case of the uncertainty.
+    It holds the results of two simulations: the search for the least factor on the planned forces
+    that holds the payload, and one run with the forces that hold it in every case of the
+    uncertainty.
 
     Args:
         carry: the carry.

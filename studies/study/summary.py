@@ -360,8 +360,8 @@ def front_indicators(
 def replica_figures(
     replica: Replica, reference: Array, selected: SelectedCarry | None, file: str | None
 ) -> ReplicaFigures:
-    """Return the figures of one replica; those that do not exist without a feasible candidate are
-    NaN or infinite.
+    """Return the figures of one replica. Without a feasible candidate, indicators of the front and
+    figures of the selected carry are NaN or infinite.
 
     Args:
         replica: the stored search.
@@ -497,8 +497,12 @@ PERCENTILES = (25.0, 50.0, 75.0, 100.0)
 
 
 def summary_stage(not_asked: str = "") -> Stage:
-    """Return the stage of a study that computes summary.json of a finished search. `not_asked` is
-    the reason that the summary states if no recommendation was requested, else ''."""
+    """Return the stage of a study that computes summary.json of a finished search.
+
+    Args:
+        not_asked: sentence that the summary states in place of a recommendation if none was
+            requested; '' if one was.
+    """
 
     return Stage("summary", partial(_run, not_asked=not_asked))
 

@@ -149,9 +149,10 @@ class Patch(ABC):
 
     @abstractmethod
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
-        """Compute -1 / t for a step length t > 0. The point `state` + t `change`, both (n,), still
-        lies inside the cone, and t is nearly the largest such length. The result is near zero if no
-        step leaves the cone."""
+        """Compute -1 / t, where t > 0 is a step length with which `state` + t `change`, both (n,),
+        lies inside the cone; t is nearly the largest such length. The result is near zero if no
+        step leaves the cone.
+        """
 
     @abstractmethod
     def slack(self, state: ca.SX) -> ca.SX:
@@ -428,8 +429,8 @@ def central_point(
 
 
 def _length(lowest: list[ca.SX], share: ca.SX | float) -> ca.SX:
-    """Compute the length of a Newton step: `share` of the way to the first boundary of a cone, at
-    most 1.
+    """Compute the length of a Newton step: `share` of the way to the boundary of the first cone
+    that the step would leave, at most 1.
 
     Args:
         lowest: for each patch -1 / t, where t is the step length at which the patch's state reaches
@@ -589,12 +590,12 @@ class Equations:
         """Compute how the states on the central path change if the load changes.
 
         Args:
-            moved: (n, k) for each of k changes of the load, the change of the components that the
-                load determines if the free components stay constant; zero for all other components.
+            moved: (n, k) for each of k changes of the load, a change of all states that balances
+                it: the components that the load determines change, the free components do not.
 
         Returns:
-            (n, k) changes of all states: `moved` plus those changes without effect on the load that
-            keep effort plus barriers minimal.
+            (n, k) changes of all states: `moved`, plus a change without effect on the load that
+            minimises effort plus barriers again.
         """
         pulls = ca.horzsplit(-ca.mtimes(self._stiff, moved))
         return moved + ca.horzcat(*map(self.balanced_change, pulls))

@@ -76,8 +76,9 @@ class EvenPatch(Patch):
         return -ca.log(torsion_capacity(grip, state[1:3], self.shape)[0] ** 2 - state[3] ** 2)
 
     def lowest(self, state: ca.SX, change: ca.SX) -> ca.SX:
-        """Compute -1 / t for a step length t > 0. The point `state` + t `change`, both (4,), still
-        lies inside the cone, and t is nearly the largest such length."""
+        """Compute -1 / t, where t > 0 is a step length with which `state` + t `change`, both (4,),
+        lies inside the cone; t is nearly the largest such length.
+        """
         # The friction limit: the lower eigenvalue of (N, T).
         square = self._grip_squared(state)
         mean = (state[0] * change[0] - ca.dot(state[1:3], change[1:3])) / square

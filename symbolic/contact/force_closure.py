@@ -88,12 +88,12 @@ class InternalForce:
 
 
 def closing_squeeze(workcell: Workcell) -> InternalForce | None:
-    """Find an internal squeeze of a workcell's pads: forces of the pads, inside their friction
-    cones, that balance one another.
+    """Find an internal squeeze of a workcell's pads: pad forces inside the friction cones that
+    balance one another.
 
-    For a margin to sliding, the squeeze is computed with less friction than the pads have. The
-    factor on the friction coefficients is the geometric mean of `SPARE_FRICTION` and of the
-    smallest factor with which a squeeze exists.
+    The squeeze lies inside the cones with a margin: it is computed with friction coefficients times
+    a factor, the geometric mean of `SPARE_FRICTION` and of the smallest factor with which a squeeze
+    exists.
 
     Returns:
         The squeeze; None if there is none with the factor `SPARE_FRICTION`.
@@ -117,7 +117,8 @@ def closing_squeeze(workcell: Workcell) -> InternalForce | None:
 
 def has_force_closure(workcell: Workcell) -> bool:
     """Return True if a workcell's pads can hold the payload under every motion, provided they press
-    strongly enough. Only `SPARE_FRICTION` of their friction counts."""
+    strongly enough. Friction coefficients are reduced by the factor `SPARE_FRICTION` for this test.
+    """
     return _balanced_states(workcell, SPARE_FRICTION) is not None
 
 

@@ -45,10 +45,11 @@ class GraspSqueeze(Grasp):
     """
 
     def __init__(self, workcell: Workcell, commanded: int) -> None:
-        """Take the constants of the grasp, or derive them from the cell.
+        """Take the constants of the grasp from a workcell with symbolic parameters, or derive them.
 
-        The internal squeeze is derived for small patches: the smallest of the relative sizes
-        `REACHES` with which friction closes the grasp, or else the full size.
+        The internal squeeze is derived for reduced patches, so that their torsion stays in reserve.
+        The factor on their sizes is the first of `REACHES` with which friction closes the grasp, or
+        1.
 
         Args:
             workcell: cell with the pads.
@@ -157,9 +158,11 @@ def commanded_forces(
     groups: dict[str, ca.MX] | None = None,
     differentiable: bool = False,
 ) -> ca.MX:
-    """Build the expression of the robots' normal forces (2,) [N]: the least commanded force of one
-    robot, which is convex in the load, and the force of the other robot that results. Both exceed
-    any limit if friction does not close the grasp.
+    """Build the expression of the normal forces (2,) [N] of both robots, by index of the robot,
+    with the least commanded force that holds the load.
+
+    The commanded force is convex in the load; the force of the other robot results. Both exceed any
+    limit if friction does not close the grasp.
 
     Args:
         squeeze: convex program, which knows the commanded robot.

@@ -169,12 +169,13 @@ class SharingHand:
 
 
 def yielded(load: Expression, hands: Sequence[SharingHand]) -> list[Expression]:
-    """Compute the wrenches (6,) with which hands balance a load, after those that would slide first
-    have passed on a part of their shares.
+    """Compute the wrenches (6,) with which hands balance a load, if hands that would slide first
+    yield a little and pass load on to all hands.
 
-    The capacity of a hand is its friction under the mean of all forces that hands need against
-    sliding. Of its load along the patch it passes on `YIELDING` times what exceeds the capacity.
-    The elastic layers of all hands share the sum of what is passed on.
+    A hand's capacity along its patch is the friction under the mean of the holding forces that all
+    hands need against sliding. Of the load along the patch it passes on `YIELDING` times the excess
+    over the capacity, less if lifting requires nearly as much force as sliding. The elastic layers
+    of all hands share what is passed on.
 
     Args:
         load: (6,) force and moment about the box frame, box axes [N, N m].

@@ -341,7 +341,9 @@ def table(benchmark: Benchmark, found: list[TaskResult], rng: np.random.Generato
 
 
 def solved(found: list[TaskResult]) -> str:
-    """Return a text with the number of carries found, and the working times."""
+    """Return a sentence with the number of tasks, of those whose start and goal can be held, and of
+    the carries found, and with the times until the carries were certified.
+    """
     held = [one for one in found if one.held]
     times = sorted(one.certified for one in found if one.certified is not None)
     told = (

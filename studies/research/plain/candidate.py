@@ -58,7 +58,7 @@ class PlainEvaluator:
         ]
 
     def __call__(self, x: Array) -> PlainCandidate:
-        """Evaluate a decision vector (n_var,)."""
+        """Compute motion, loads and constraints of a decision vector (n_var,), no collisions."""
         time, pose, rate, second = timed_motion(self.workcell.task, x)
         loads = [
             sample_load(self.workcell, *sample) for sample in zip(pose, rate, second, strict=True)
@@ -172,7 +172,9 @@ class PlainJudge:
         self.checker = PlainCollisionChecker(workcell)
 
     def __call__(self, x: Array) -> PlainVerdict:
-        """Evaluate a decision vector (n_var,)."""
+        """Decide whether a decision vector (n_var,) is feasible, collisions included, and compute
+        its objectives.
+        """
         candidate = self.evaluator(x)
         outputs = candidate.outputs
         time, n = outputs["time"], len(outputs["time"])
