@@ -290,12 +290,11 @@ def sample_functions(model: CellModel) -> dict[str, ca.Function]:
 
 
 def kernel_numbers(workcell: Workcell, screen: Screen) -> dict[str, tuple[str, ...]]:
-    """Return the names of the parameter groups that each function of `kernel_functions` takes as
-    its last inputs.
+    """Return which parameter groups each function of `kernel_functions` takes as its last inputs.
 
     Args:
         workcell: the cell, with symbols as parameters.
-        screen: the bodies' distance bounds, with symbols as parameters.
+        screen: constants of the bodies' distance bounds, with symbols as parameters.
 
     Returns:
         Names of the groups in the order of the inputs, by name of the function.
@@ -412,11 +411,11 @@ def _row_max(matrix: ca.MX) -> ca.MX:
 
 
 def _time_share(time: ca.MX) -> ca.MX:
-    """Compute the share (1, n) of the duration that each sample represents: half the time steps
-    before and after it.
+    """Compute the share (1, n) of the whole duration that each sample represents, from the middle
+    of the time step before it to the middle of the one after it. The shares add up to 1.
 
     Args:
-        time: (1, n) times of the samples [s].
+        time: (1, n) times of the samples [s], beginning at 0.
     """
     steps = time[:, 1:] - time[:, :-1]
     return (ca.horzcat(0.0, steps) + ca.horzcat(steps, 0.0)) / (2.0 * time[-1])

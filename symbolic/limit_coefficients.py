@@ -215,11 +215,11 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
 
 
 def _load_function(workcell: Workcell) -> ca.Function:
-    """Build the function of the load that the pads have to balance, and of its derivatives by the
-    timing.
+    """Build the function of the load that the pads have to balance at one sample, and of its
+    derivatives by the timing.
 
-    Inputs: the blocks force and moment of `limit_layout` as one vector (15,), u'', u'^2, and the
-    payload's parameters. Outputs: force and moment (6,) about the box frame's origin, along the
+    Inputs: the blocks force and moment of `limit_layout` as one vector (15,), then u'', u'^2, and
+    the payload's parameters. Outputs: force and moment (6,) about the box frame's origin, along the
     box's axes [N, N m]; and its derivatives (6, 2) by u'' and u'^2.
     """
     size = limit_layout(workcell).sizes["force"]
@@ -304,13 +304,14 @@ def contact_limits(
     timing: tuple[ca.SX, ca.SX],
     implicit: ImplicitVariables,
 ) -> tuple[ca.SX, ca.SX]:
-    """Compute the quantities that the contact forces limit at one sample.
+    """Compute the limited quantities at one sample that depend on the contact forces.
 
     Args:
         workcell: the cell.
         blocks: the blocks force, moment, torque and wrench of `limit_layout`, by name.
         timing: u'' and u'^2.
-        implicit: collector of results of Newton's method, for exact derivatives.
+        implicit: stores the results of Newton's method, so that derivatives of the forces become
+            exact.
 
     Returns:
         Ratios (joints + 2,) to the limits, first the signed joint torques of both arms, then the
@@ -395,8 +396,8 @@ def _slopes(
         name: name of the function.
         value: the expression.
         inputs: symbols of the function's inputs by name; `a` and `w` are among them.
-        implicit: collector of results of Newton's method. These results are the function's last
-            input, called `solved`.
+        implicit: holds the symbols in `value` that stand for results of Newton's method. These
+            results are the function's last input, called `solved`.
     """
     value = ca.densify(value)
     by = {f"by_{z}": ca.densify(ca.jacobian(value, inputs[z])) for z in ("a", "w")}

@@ -59,8 +59,7 @@ class Limit:
 
     @property
     def is_signed(self) -> bool:
-        """True if the limited quantity may be positive or negative, with the same limit in both
-        directions."""
+        """True if the limited quantity has a sign and its absolute value is limited."""
         return self.block in ("acceleration", "torque")
 
 
@@ -194,9 +193,9 @@ def limits_of_block(block: str) -> tuple[Limit, ...]:
 
 
 def passes_enumeration() -> str:
-    """Return C source text that declares all limits, and the `group` of each limit, for the
-    compiled forward and backward passes of a timing.
-    """
+    """Return C source text with two enumerations, the kinds and the groups of all limits, and an
+    array that maps each kind to its group. The compiled forward and backward passes of a timing
+    include it."""
     groups = list(dict.fromkeys(limit.group for limit in LIMITS))
     names = ", ".join(limit.symbol for limit in LIMITS)
     own = ", ".join(limit.group.upper() for limit in LIMITS)

@@ -330,8 +330,8 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
 def _grasp(
     take: _Take, group: str, path: str, cell: Workcell, commanded: int | None
 ) -> GraspNumbers:
-    """Return the constants of a grasp by pads with every array replaced by a placeholder or a
-    symbol. The numbers are computed when they are first needed.
+    """Return the constants of the grasp of pads with any normals, in which every array is replaced
+    by a placeholder or a symbol. Their values are computed when they are first needed.
 
     Args:
         take: replaces a parameter by a placeholder or a symbol.
@@ -365,12 +365,12 @@ def _grasp(
 
 
 def _as(kind: Any, record: Any, **changes: Any) -> Any:
-    """Convert a record to another class that has the same fields and perhaps further ones.
+    """Convert a record to a class with the same fields and perhaps further ones.
 
     Args:
-        kind: the other class.
-        record: record whose values are taken.
-        changes: values of fields that differ from the record, or that the record lacks.
+        kind: the new class.
+        record: record from which the fields' values are taken.
+        changes: values of fields that differ from the record's, or that the record lacks.
     """
     known = {each.name: getattr(record, each.name) for each in fields(record)}
     return kind(**(known | changes))
@@ -493,7 +493,7 @@ def _joint(take: _Take, joint: RedundantJoint) -> NumberedJoint:
 
 
 def _screen(take: _Take, screen: Screen) -> Screen:
-    """Return the numbers for distance bounds in which `take` has replaced every parameter by a
+    """Return the constants of the distance bounds in which `take` has replaced every parameter by a
     placeholder or a symbol.
 
     Shapes of links and of meshes remain unchanged, as part of the topology.
@@ -542,8 +542,8 @@ def _body(take: _Take, path: str, body: ScreenBody) -> Any:
 
 
 def _own(take: _Take, path: str, value: Any) -> Any:
-    """Return a record of a body in which every array is replaced by a placeholder or a symbol, in
-    the order of the fields.
+    """Return a copy of a body's record in which every array, also in nested records and tuples, is
+    replaced by a placeholder or a symbol, in the order of the fields.
 
     Args:
         take: replaces a parameter by a placeholder or a symbol.

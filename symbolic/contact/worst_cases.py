@@ -103,7 +103,7 @@ def case_gradient_function(
     workcell: Workcell, commanded: int = 1, numbers: bool = False
 ) -> ca.Function:
     """Build the function of the least commanded normal forces in one case of an uncertainty, with
-    derivatives by the motion.
+    their derivatives by the motion.
 
     Inputs and the output normal_force (2,) are those of `case_squeeze_function`. The output slope
     (NumPy shape (2, 18)) has the derivatives of each force by pose, rate and second_rate. For two
@@ -113,9 +113,9 @@ def case_gradient_function(
     Args:
         workcell: the workcell.
         commanded: index of the robot whose force is commanded.
-        numbers: True to append to slope the derivatives by the case (18,), then by the cell's
-            symbolic parameters. For pads with any normals, derivatives by the load (6,) of
-            `case_origin_load_function` take the place of the derivatives by the parameters.
+        numbers: True to append further columns to slope: the derivatives by the case (18,), then by
+            the cell's symbolic parameters. For pads with any normals, the derivatives by the load
+            (6,) of `case_origin_load_function` take the place of those by the parameters.
     """
     squeeze, inputs = _program_and_inputs(workcell, commanded)
     by = [*inputs.values()] if numbers else [inputs[name] for name in MOTION]

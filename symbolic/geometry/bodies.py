@@ -97,7 +97,9 @@ class ArmGeometry(ContentRecord):
 
     @cached_property
     def chain(self) -> str:
-        """Digest of the joints, independent of the arm's base and of the box that the arm holds."""
+        """Digest of the joints' frames, axes and limits. It is equal for arms that differ only in
+        the pose of their base or in the box that they hold, so results cached under it serve all of
+        them."""
         own = self.origins, self.axes, self.turning, self.lower, self.upper
         return digest_of_parts(own)
 
@@ -183,11 +185,11 @@ def arm_geometry(workcell: Workcell, i: int) -> ArmGeometry:
 
 
 def _check_effort(bodies: list[CollisionBody], most_pieces: int) -> None:
-    """Check that the bodies have at most `most_pieces` convex pieces, so that all pairs can be
-    checked within seconds.
+    """Check that collision checks of the bodies finish within seconds: that the bodies have at most
+    `most_pieces` convex pieces and `MOST_CORNERS` corners.
 
     Raises:
-        CollisionModelError: the bodies have more pieces, or more than `MOST_CORNERS` corners.
+        CollisionModelError: the bodies have more pieces or corners.
     """
     pieces = sum(len(body.pieces) for body in bodies)
     largest = max(bodies, key=lambda body: len(body.pieces))
@@ -341,11 +343,12 @@ class MeshReader:
         self.known: dict[tuple[Path, tuple[float, ...]], CutMesh] = {}
 
     def hulls(self, mesh: Mesh) -> tuple[Hull, ...]:
-        """Read a mesh, or look it up, and return its convex pieces in the mesh's frame.
+        """Return the convex pieces of a mesh in the mesh's frame. A mesh that was read before is
+        not read again.
 
         Raises:
-            CollisionModelError: the mesh cannot be read or decomposed, or all meshes so far have
-                too many triangles.
+            CollisionModelError: the mesh cannot be read or decomposed, or all meshes read so far
+                have too many triangles together.
         """
         # Not imported at the top: trimesh takes long to start, and most cells have no meshes.
         from symbolic.read.meshes import MOST_CELL_FACES
@@ -366,8 +369,8 @@ class MeshReader:
 
 
 def _state(path: Path) -> tuple[int, int]:
-    """Return a file's modification time [ns] and size [bytes], zeros for a missing file. Whoever
-    reads the file reports that it is missing."""
+    """Return a file's modification time [ns] and size [bytes], by which a changed file is
+    recognised. Both are zero for a missing file; the attempt to read it then raises the error."""
     try:
         found = path.stat()
     except OSError:

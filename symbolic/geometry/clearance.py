@@ -62,20 +62,22 @@ def screening_functions(
 
     All take one sample: pose (6,) of the box, joint positions q_1 and q_2 (n,) [m, rad].
 
-    - clearance returns lower bounds (n_near,) [m] of the distances of the near possible pairs
-      (`CellGeometry.near`), in order.
+    - clearance returns lower bounds (n_near,) [m] of the distances of the near pairs, the first
+      `CellGeometry.near` of `CellGeometry.possible`, in order.
     - far_clearance returns lower bounds of the distances of the other possible pairs [m]. It exists
       only if there are any.
     - piece_poses returns the poses in the world of all pieces of all bodies, in the order of the
       bodies: quaternions (4, n_pieces) as w x y z, and positions (3, n_pieces) [m].
-    - motion and far_motion are the functions of `motion_function` for near and other pairs.
+    - motion and far_motion are the functions of `motion_function` for the near and for the other
+      pairs. They take two samples.
 
     Args:
         geometry: bodies and pairs of the cell.
         joint_placements: the function `RobotModel.joint_placements` of each robot.
         softness: `EXACT` for screening; `Softness(width)` for smooth bounds that are lower by a few
             widths [m].
-        screen: numbers of the bodies, as arrays or symbols; None to compute them here.
+        screen: constants of the bodies and pairs for the bounds, as arrays or symbols; None to
+            compute them from `geometry`.
     """
     screen = screen_of(geometry) if screen is None else screen
     pose = ca.SX.sym("pose", 6)
@@ -141,9 +143,8 @@ BOX_NUMBERS = 15
 
 
 def box_numbers(body: CollisionBody) -> Array:
-    """Return the rotation (3, 3), centre (3,) and half edges (3,) of a fixed box in the world as
-    one array (BOX_NUMBERS,) [m].
-    """
+    """Return rotation (3, 3), centre (3,) and half edges (3,) of a fixed box in the world, one
+    after the other, as an array (BOX_NUMBERS,) [m]."""
     (piece,) = body.pieces
     assert isinstance(piece.shape, Box)
     half = np.asarray(piece.shape.size) / 2.0
@@ -164,7 +165,7 @@ class DistanceBounds:
         """Store the placements; expressions are built on demand.
 
         Args:
-            screen: numbers of the bodies and pairs of the cell.
+            screen: constants of the cell's bodies and pairs, as arrays or symbols.
             R_box, p_box: (3, 3) rotation and (3,) position [m] of the box in the world.
             placements: for each robot the rotations (3, 3 n) and positions (3, n) [m] of the joint
                 frames in the root, side by side, from `RobotModel.joint_placements`.
@@ -211,7 +212,8 @@ class DistanceBounds:
         return self.soft.maximum_below(gaps)
 
     def separable(self, pair: int) -> bool:
-        """Return True if a pair is the payload and a body of the environment that is a single box.
+        """Return True if a pair of bodies allows constraints by separating directions
+        (`separation`): the payload and a body of the environment that is a single box.
 
         Args:
             pair: index of the pair among the possible pairs.
@@ -247,7 +249,8 @@ class DistanceBounds:
         return list(zip(self._interval(i, axes), self._interval(j, axes), strict=True))
 
     def _gap(self, pairs: Sequence[tuple[Interval, Interval]]) -> ca.SX:
-        """Compute the largest gap [m] between two bodies over several directions.
+        """Compute a lower bound of the distance of two bodies [m]: the largest gap between their
+        intervals over several directions.
 
         Args:
             pairs: for each direction the intervals (least, largest coordinate) of the first and of
@@ -323,8 +326,8 @@ class DistanceBounds:
         return Axes(str(frame), self._placed[frame][0].T)
 
     def _chain(self, index: int) -> tuple[list[ca.SX], ca.SX]:
-        """Compute the row of equal spheres that encloses a body: centres (3,) in the world, and
-        radius [m].
+        """Compute the world positions of the equal spheres in a row that enclose a body: centres
+        (3,) and their common radius [m].
 
         Args:
             index: index of the body.
@@ -338,7 +341,8 @@ class DistanceBounds:
         return self._chains[index], ca.SX(number(body.chain.radius))
 
     def _nearest(self, squared: Sequence[ca.SX]) -> ca.SX:
-        """Compute the smallest of several distances [m] from their squares [m^2]."""
+        """Compute the smallest of several distances [m], or a smooth lower bound of it, from their
+        squares [m^2]."""
         if self.soft.width:
             return self.soft.minimum_below([self.soft.norm_below(s) for s in squared])
         return self.soft.norm_below(self.soft.minimum_below(squared))
@@ -398,7 +402,8 @@ class DistanceBounds:
 
     def _obstacle(self, index: int, other: int, k: int) -> ca.SX:
         """Return a lower bound of the distance between a moving body and one piece of an obstacle
-        [m].
+        [m]: the largest gap along the world's or the piece's axes and, for elongated bodies, along
+        the body's own axes. For a round piece the distance to the body's spheres counts too.
 
         Args:
             index: index of the moving body among all bodies.
@@ -485,7 +490,7 @@ def motion_function(
     name: str,
     pairs: Iterable[int],
 ) -> ca.Function:
-    """Build the function that bounds the relative motion of pairs of bodies between two
+    """Build the function that bounds how pairs of bodies move relative to each other between two
     configurations a and b.
 
     Inputs: pose_a (6,), q_1_a, q_2_a (n,), then pose_b, q_1_b, q_2_b [m, rad]. Outputs: chord and
@@ -493,13 +498,13 @@ def motion_function(
     the distance between the positions of any of its points in a and b. A body's bend bounds the
     second derivative of the point's path from a to b, for a path parameter that runs from 0 to 1.
 
-    Two links of one arm are an exception: chord bounds the length of the path that the later link's
-    points take as seen from the earlier link, and bend is zero.
+    Two links of one arm are an exception: chord bounds the length of the path of the later link's
+    points in the frame of the earlier link, and bend is zero.
 
     Args:
         geometry: bodies and pairs of the cell.
         joint_placements: the function `RobotModel.joint_placements` of each robot.
-        screen: numbers of the bodies.
+        screen: constants of the bodies, as arrays or symbols.
         name: name of the new function.
         pairs: indices among the possible pairs.
     """
@@ -547,7 +552,7 @@ def _body_motion(
     runs from 0 to 1.
 
     Args:
-        screen: numbers of the bodies.
+        screen: constants of the bodies, as arrays or symbols.
         body: the body.
         placed_a, placed_b: rotation (3, 3) and position (3,) [m] of every frame in the world, in
             configuration a and b.
@@ -568,10 +573,11 @@ def _body_motion(
 
 
 def _between_links(first: ScreenBody, second: ScreenBody, step: ca.SX) -> ca.SX:
-    """Compute an upper bound of the length of a link's path as seen from an earlier link [m].
+    """Compute an upper bound of the length of the path of a link's points in the frame of an
+    earlier link of the same arm [m].
 
     Args:
-        first, second: the earlier and the later link of one arm.
+        first, second: the earlier and the later link.
         step: (n,) absolute changes of the arm's joint positions [rad or m].
     """
     assert second.reach is not None, "the later of two links moves"

@@ -54,11 +54,12 @@ _DIRECTIONS = _directions()
 
 
 def slab_cover(body: CollisionBody) -> tuple[Piece, ...]:
-    """Return a cover of a body: boxes, cylinders, spheres and capsules that together contain the
+    """Return a cover of a body: boxes, cylinders, spheres and capsules whose union contains the
     body.
 
-    A simple shape is its own cover. A hull gets its smallest box among a few orientations. Pieces
-    inside a box of the cover are dropped, and pieces that nearly fill a common box are merged.
+    A simple shape is its own cover. A hull gets the smallest box in one of a few orientations.
+    Pieces inside a box of the cover are dropped, and pieces that nearly fill a common box are
+    merged.
     """
     return _slab_cover(CacheKey(body.pieces, body.name))
 
@@ -88,8 +89,8 @@ def _chain_cover(seen: CacheKey) -> SphereChain:
 
 
 def close_pairs(geometry: CellGeometry) -> frozenset[tuple[int, int]]:
-    """Return the pairs of bodies of one arm whose rows of spheres (`chain_cover`) overlap in many
-    postures.
+    """Return the pairs of bodies of one arm whose distances have to be bounded piece by piece,
+    because their rows of spheres (`chain_cover`) overlap in many postures.
 
     Each pair consists of the indices of both bodies.
     """
@@ -125,8 +126,8 @@ def _often_close(seen: CacheKey) -> bool:
 
 @lru_cache(maxsize=4)
 def _steps(seen: CacheKey) -> list[Array]:
-    """Compute the pose of each joint's frame in the frame of the joint before it, at random
-    postures.
+    """Compute the pose of each joint's frame in the frame of the joint before it, in the same
+    random postures in every call.
 
     Args:
         seen: cache key that holds the geometry of the arm.
@@ -148,7 +149,8 @@ def _steps(seen: CacheKey) -> list[Array]:
 
 
 def _apart(first: tuple[Piece, ...], second: tuple[Piece, ...], T: Array) -> NDArray[np.bool_]:
-    """Return True for each pose (n,) in which a coordinate axis separates two sets of pieces.
+    """Return for n relative poses of two sets of pieces whether a coordinate axis of the first
+    frame separates the sets, (n,).
 
     Args:
         first, second: the sets, each in the frame of its body.
@@ -184,7 +186,7 @@ def _volume(box: Piece) -> float:
 
 
 def _orientations(pieces: tuple[Piece, ...]) -> list[Array]:
-    """Return rotations (3, 3) to try for boxes that cover a body, each once.
+    """Return the rotations (3, 3) of boxes that are tried as covers of a body, without repetition.
 
     These are the body's axes, each piece's axes, and the principal axes of the vertices of each
     hull.
@@ -215,10 +217,11 @@ def _outermost(cover: list[Piece]) -> list[Piece]:
 
 
 def _merge_once(cover: list[Piece]) -> list[Piece] | None:
-    """Replace two pieces of a cover by the box around both.
+    """Merge two pieces of a cover into a box around both: those two, and that box, for which the
+    box exceeds the pieces' common hull least.
 
-    The chosen pair is the one whose box adds least to the pieces. The result is None if the boxes
-    of all pairs stand out from their pieces by more than `MERGE_SLACK`.
+    Returns:
+        The new cover; None if every box exceeds the hull by more than `MERGE_SLACK`.
     """
     best: tuple[float, int, int, Piece] | None = None
     for i, j in combinations(range(len(cover)), 2):

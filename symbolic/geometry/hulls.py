@@ -98,11 +98,11 @@ def cut(mesh: trimesh.Trimesh, path: Path) -> CutMesh:
 
 
 def _may_be_cut(triangles: Array, filled: float) -> bool:
-    """Return True if `decompose` might cut a component of a mesh after the holes in its surface are
-    closed.
+    """Return True if a component of a mesh is used as one hull only because its surface has holes:
+    `decompose` might cut it once they are closed.
 
-    If the result is False, `decompose` certainly does not cut: triangles that close a hole only
-    enlarge the hulls of both halves of a cut.
+    If the result is False, `decompose` certainly would not cut it, because triangles that close a
+    hole only enlarge the hulls of both halves of a cut.
 
     Args:
         triangles: (n, 3, 3) corners of the component's triangles [m].
@@ -129,11 +129,12 @@ LARGE_PARTS = 24
 
 
 def _parts(mesh: trimesh.Trimesh) -> tuple[list[trimesh.Trimesh], list[NDArray[np.intp]]]:
-    """Split a mesh into its connected components, and separate small components if there are many.
+    """Split a mesh into its connected components. If there are many, only the largest are kept as
+    components.
 
     Returns:
-        Components that become hulls of their own, as meshes; the other, small components, each as
-        an array of face indices.
+        Components that become hulls of their own, as meshes; and the remaining small components,
+        each as an array of face indices.
     """
     nodes = np.arange(len(mesh.faces))
     parts = list(trimesh.graph.connected_components(mesh.face_adjacency, nodes=nodes, min_len=1))
@@ -318,10 +319,9 @@ def simplify(hulls: list[Hull]) -> tuple[Hull, ...]:
 def thin(hull: Hull) -> Hull:
     """Return a hull with fewer corners that contains `hull` and exceeds it by at most `STAND_OUT`.
 
-    A linear map moves every face of the hull outwards. Corners are selected until their convex hull
-    contains the preimage of all corners under the map. The map of this convex hull then contains
-    the given hull. The given hull itself is returned if more than `THINNED_SHARE` of its corners
-    would be kept.
+    Corners of `hull` are selected until the convex hull of the selected ones, stretched by
+    `_Growth`, contains all corners of `hull`. This stretched hull is the result. If it needs more
+    than `THINNED_SHARE` of the corners, `hull` itself is returned.
     """
     growth, corners = _Growth(hull), hull.vertices
     seeds = np.unique(np.argmax(corners @ growth.axes @ START_DIRECTIONS.T, axis=0))
@@ -369,11 +369,11 @@ class _Growth:
         self.preimage = self._stretched(corners, 1.0 / self._factors)
 
     def moved(self, points: Array) -> Array:
-        """Apply the map to points (n, 3) in the frame of the hull [m]."""
+        """Stretch points (n, 3) by this map, in the frame of the hull [m]."""
         return self._stretched(points, self._factors)
 
     def hull_contains(self, points: Array) -> bool:
-        """Return True if the hull, not stretched, contains all points (n, 3) [m]."""
+        """Return True if the hull itself, without stretching, contains all points (n, 3) [m]."""
         return not _beyond(points, self.planes)
 
     def takes_in(self, points: Array) -> bool:

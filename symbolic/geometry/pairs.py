@@ -117,15 +117,16 @@ class CellGeometry:
 
     @cached_property
     def columns(self) -> NDArray[np.intp]:
-        """(n_active,) index of each active pair among the possible pairs, which are the columns of
-        the compiled functions named in `asked`, one function after the other."""
+        """(n_active,) index of each active pair among the possible pairs. In the outputs of the
+        functions `asked`, joined in order, it is the column of the pair's distance."""
         places = {pair: k for k, pair in enumerate(self.possible)}
         return np.array([places[pair] for pair in self.active], dtype=np.intp)
 
     @cached_property
     def asked(self) -> tuple[str, ...]:
-        """Prefixes of the names of the compiled functions to be evaluated: '' for the near pairs,
-        and `FAR` if any of the other pairs is active."""
+        """Prefixes of the names of those compiled functions that have to be evaluated for the
+        active pairs: always '' for the near pairs, and `FAR` if any of the other pairs is active.
+        """
         blocks = self.blocks.items()
         return tuple(b for b, pairs in blocks if not b or np.isin(self.columns, pairs).any())
 
@@ -160,9 +161,8 @@ class CellGeometry:
 def pair_tolerance(workcell: Workcell, a: CollisionBody, b: CollisionBody) -> float:
     """Return the distance up to which the bodies a and b count as colliding [m].
 
-    This is the workcell's tolerance. For the payload the uncertainty of the pads' positions is
-    added, if the cell states one: a box that is displaced in the grasp stays displaced along the
-    path.
+    It is the workcell's tolerance. If one body is the payload, the stated uncertainty of the pads'
+    positions is added, because a box that is displaced in the grasp stays displaced along the path.
     """
     return _tolerance(workcell, "box" in (a.frame.kind, b.frame.kind))
 
@@ -373,8 +373,9 @@ def _rigid(a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeome
 
 
 def _neighbours(a: CollisionBody, b: CollisionBody, bodies: tuple[CollisionBody, ...]) -> str:
-    """Return the reason to exclude two neighbouring links of one arm, or an arm's mount and its
-    first link; else ''.
+    """Return the reason to exclude a pair of bodies that overlap at a joint: two neighbouring links
+    of one arm, or an arm's first link and the body on which the arm is mounted. Return '' for other
+    pairs.
 
     Args:
         a, b: the two bodies.
@@ -396,10 +397,8 @@ def _neighbours(a: CollisionBody, b: CollisionBody, bodies: tuple[CollisionBody,
 def _always_touching(
     a: CollisionBody, b: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]
 ) -> str:
-    """Return the reason to exclude two bodies of one arm that touch in every sampled posture; else
-    ''.
-
-    One of the bodies may be the held box.
+    """Return the reason to exclude two bodies that touch in every one of many random postures: two
+    bodies of one arm, or such a body and the held box. Return '' for other pairs.
 
     Args:
         a, b: the two bodies.

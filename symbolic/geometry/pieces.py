@@ -214,11 +214,9 @@ def box_corners(size: Array) -> Array:
 
 
 def skeleton(piece: Piece) -> tuple[Array, float]:
-    """Return points (n, 3) in the body's frame and a radius [m] that represent a piece.
-
-    The points' convex hull, thickened by the radius, contains the piece. It equals the piece except
-    for cylinders, which get caps like a capsule.
-    """
+    """Describe a piece by points (n, 3) in the body's frame and a radius [m]. The points' convex
+    hull, thickened by the radius, contains the piece; it equals the piece except for cylinders,
+    which get caps like a capsule."""
     shape = piece.shape
     radius = 0.0
     match shape:
@@ -274,9 +272,8 @@ def bounding_box(pieces: tuple[Piece, ...], rotation: Array) -> Piece:
 
 
 def edges(pieces: tuple[Piece, ...]) -> Array:
-    """Compute the edge lengths (3,) of the pieces' bounding box along the frame's axes, ascending
-    [m].
-    """
+    """Compute the edge lengths (3,) of the bounding box of pieces along their common frame's axes,
+    in ascending order [m]."""
     box = bounding_box(pieces, np.eye(3))
     assert isinstance(box.shape, Box)
     return np.asarray(np.sort(box.shape.size))
@@ -334,12 +331,14 @@ class SphereChain:
 
 
 def sphere_chain(pieces: tuple[Piece, ...], rotation: Array, slenderness: float) -> SphereChain:
-    """Cover pieces by a row of equal spheres along the longest side of their bounding box.
+    """Cover pieces by a row of equal spheres along the longest side of their bounding box. The box
+    is cut into slabs across this side, and each sphere contains one slab.
 
     Args:
         pieces: pieces in one frame.
         rotation: (3, 3) axes of the bounding box in this frame, as columns.
-        slenderness: approximate length of a slab over the width of the box.
+        slenderness: approximate ratio of a slab's length along the row to the larger of its other
+            two sides.
 
     Raises:
         CollisionModelError: a slab is not inside its sphere, or a piece not inside the box.

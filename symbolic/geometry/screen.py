@@ -220,8 +220,8 @@ def has_hulls(body: CollisionBody) -> bool:
 
 
 def _seen(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> CacheKey:
-    """Return the cache key of a body. It holds the body and both arms; keys are equal if the body
-    and the geometry of the arm that moves it are equal."""
+    """Return the cache key of a body's constants. It holds the body and both arms. Keys are equal
+    if the bodies are equal and the arms that move them have the same geometry."""
     of: tuple[Any, ...] = (body.content,)
     if body.frame.kind == "link":
         of = (body.content, arms[body.frame.robot].chain)
@@ -363,8 +363,9 @@ def reach_about_joints(body: CollisionBody, arm: ArmGeometry) -> Array:
 
 
 def _slanted_matters(body: CollisionBody) -> bool:
-    """Return True if distances of a body to obstacles are also to be bounded along the body's own
-    axes: for the payload, and for a body longer than wide by more than `SLANTED_LENGTH`."""
+    """Return True if the distances of a body to obstacles have to be bounded along the body's own
+    axes too. This holds for the payload, and for a body whose longest edge exceeds the next by more
+    than `SLANTED_LENGTH`."""
     _, width, length = edges(body.pieces)
     return body.frame.kind == "box" or bool(length - width > SLANTED_LENGTH)
 
@@ -381,11 +382,12 @@ def _between(first: Array, second: Array) -> Array | None:
 
 
 def turned(rotation: Any) -> ca.SX:
-    """Return a rotation (3, 3) as an expression; the identity if `rotation` is None."""
+    """Return a rotation (3, 3), a matrix of numbers or symbols, as an expression; the identity if
+    it is None."""
     return ca.SX.eye(3) if rotation is None else ca.SX(number(rotation))
 
 
 def columns(values: Any) -> Sequence[ca.SX]:
-    """Return the rows (n, 3) of an array as a sequence of column vectors (3,)."""
+    """Return the n rows of an array (n, 3) as column vectors (3,)."""
     whole = ca.SX(number(values))
     return [whole[k, :].T for k in range(whole.shape[0])]

@@ -28,13 +28,13 @@ from symbolic.records.content import CacheKey
 
 
 def anchor(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry], robot: int) -> CollisionBody:
-    """Return a body as seen by one arm. For the held box this is a copy that is fixed to the arm's
-    last link; any other body is returned unchanged.
+    """Return a body with a frame that does not depend on the other arm: a held box becomes a copy
+    that is fixed to the last link of one arm. Any other body is returned unchanged.
 
     Args:
         body: the body.
         arms: joints of both arms.
-        robot: index of the arm that holds the box.
+        robot: index of the arm to which the box is fixed.
     """
     if body.frame.kind != "box":
         return body
@@ -50,8 +50,8 @@ def _anchored(seen: CacheKey) -> CollisionBody:
 
 
 def moving_arms(a: CollisionBody, b: CollisionBody) -> tuple[int, ...]:
-    """Return the indices of the arms, 0 or 1, that may move bodies a and b relative to each other;
-    both arms if a or b is the payload."""
+    """Return the indices of the arms, 0 or 1, that may move bodies a and b relative to each other.
+    If one body is the payload, these are both arms."""
     if "box" in (a.frame.kind, b.frame.kind):
         return (0, 1)
     return tuple(robot for robot in (0, 1) if robot in (a.frame.robot, b.frame.robot))
@@ -62,12 +62,10 @@ def sorted_by_joint(
 ) -> tuple[CollisionBody, CollisionBody]:
     """Return two bodies in the order of the joints that carry them, the earlier joint first.
 
-    A held box counts as fixed to the last joint of an arm (`anchor`).
-
     Args:
         a, b: the bodies.
         arms: joints of both arms.
-        robot: index of the arm.
+        robot: index of the arm to whose last joint a held box counts as fixed (`anchor`).
     """
     left, right = anchor(a, arms, robot), anchor(b, arms, robot)
     return (left, right) if left.frame.joint <= right.frame.joint else (right, left)
@@ -190,8 +188,8 @@ def never_meet(
 
 
 def _zone(body: CollisionBody, arm: ArmGeometry, below: int) -> Piece:
-    """Return a region that contains a body of an arm at all positions of some of the arm's joints:
-    those after the joint `below`, up to the body's own.
+    """Return a region that contains a body of an arm at all positions of the joints after the joint
+    `below`, up to the body's own joint.
 
     If this is one turning joint, the region is the cylinder that the body sweeps about the joint's
     axis. Otherwise it is a ball about the first of the joints, with the length of the stretched

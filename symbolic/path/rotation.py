@@ -107,8 +107,8 @@ def _quaternion_rates(
 def _derivatives(
     series: Sequence[float], square: Expression, moved: Expression, pushed: Expression
 ) -> Quaternion:
-    """Compute the first and second time derivative of the power series sum_n c_n s^n of a variable
-    s.
+    """Compute the first and second time derivative of f(s) = sum_n c_n s^n, for a variable s that
+    depends on time.
 
     Args:
         series: coefficients c_n, from n = 0.

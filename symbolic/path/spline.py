@@ -79,8 +79,8 @@ def path_position(n_waypoints: int, parameter: Array) -> Array:
 
 @cache
 def _natural_splines(n_waypoints: int) -> tuple[Callable[[Array], Array], ...]:
-    """Build three functions of n values of u in [0, 1]: natural quintic splines, their first and
-    their second derivatives by u.
+    """Build the natural quintic splines through unit values at the waypoints: functions of n values
+    of u in [0, 1] for the splines, their first and their second derivatives by u.
 
     Each function returns a matrix (n, n_waypoints). Column k belongs to the spline that is 1 at
     waypoint k and 0 at all others.
@@ -162,11 +162,12 @@ NO_GROUPS: MXGroups = MappingProxyType({})
 
 
 def _fixed(task: Task, value: Any, x: Expression, groups: MXGroups) -> Expression:
-    """Return a parameter of the task as an expression of the type of the decision vector, SX or MX.
+    """Return a value that the task fixes as an expression of the same CasADi type as the decision
+    vector, SX or MX.
 
     Args:
         task: the task.
-        value: number or symbolic expression of the parameter.
+        value: number or symbolic expression.
         x: decision vector, whose type the result has.
         groups: MX vectors of the task's parameters, by name of the parameter group; empty for plain
             numbers.
@@ -321,7 +322,8 @@ def coarse_entries(task: Task) -> NDArray[np.intp]:
 
 
 def hierarchical_basis(task: Task) -> tuple[Array, Array]:
-    """Compute a hierarchical basis of the path variables, from coarse to fine waypoints.
+    """Compute a basis in which an optimiser changes a refined path: its coarse variables move the
+    path smoothly over long distances, its fine variables locally.
 
     The grid of the file's waypoints is refined in steps, by halves as long as that is possible.
     Each waypoint belongs to the coarsest grid that contains it. A move of a waypoint also moves the
