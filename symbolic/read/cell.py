@@ -378,8 +378,9 @@ REACH_SLACK = 1e-6  # [m], rounding of a flange exactly at full stretch
 
 
 def check_names(workcell: Workcell, problems: Problems) -> None:
-    """Record a problem for each name that is not unique although key paths or options
-    address it."""
+    """Record a problem for each name that is ambiguous: the name of a robot or obstacle that
+    another one or the payload has too, a tool body with the name of another body of its robot, and
+    an obstacle with '/' in its name, which marks bodies of robots."""
     robots = [(f"robots[{i}].name", robot.name) for i, robot in enumerate(workcell.robots)]
     bodies = [(f"environment[{i}].name", b.name) for i, b in enumerate(workcell.environment)]
     _check_unique([("'payload' (reserved)", PAYLOAD_NAME), *robots, *bodies], problems)
@@ -446,8 +447,9 @@ def check_uncertainty(workcell: Workcell, problems: Problems) -> None:
 
 
 def check_shapes(workcell: Workcell, problems: Problems) -> None:
-    """Record a problem if the cell has more collision shapes than the allowed number of convex
-    pieces; each shape has at least one piece."""
+    """Record a problem if the cell has more collision shapes than `collision.most_pieces` allows
+    convex pieces. Each shape has at least one piece, so no mesh has to be decomposed for this
+    check."""
     most = workcell.collision.most_pieces
     if not problems.clean("collision.most_pieces", *_of_robots("urdf")):
         return
@@ -468,7 +470,8 @@ def check_shapes(workcell: Workcell, problems: Problems) -> None:
 
 
 def check_references(workcell: Workcell, problems: Problems) -> None:
-    """Record a problem for each name in allowed contacts or ignored pairs that does not exist."""
+    """Record a problem for each name in `task.allowed_contacts` or `collision.ignored` that matches
+    no body."""
     if not problems.clean("environment"):
         return
 
@@ -579,7 +582,7 @@ def _fixed_poses(workcell: Workcell) -> Iterator[tuple[str, Array]]:
 
 
 def check_all(workcell: Workcell, problems: Problems, reach: bool) -> None:
-    """Make every check across sections that needs no inverse kinematics.
+    """Make all checks of a workcell that need values of several sections but no inverse kinematics.
 
     Args:
         workcell: the workcell.

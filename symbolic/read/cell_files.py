@@ -263,11 +263,15 @@ def _is_plain(name: str) -> bool:
 
 
 def _check_references(stored: CellFiles, root: Path) -> None:
-    """Check that no workcell file or URDF refers to anything outside the stored files.
+    """Check that a stored workcell file and its URDFs name only stored files, and that robots are
+    described by plain URDF, neither xacro nor MJCF.
 
     Args:
         stored: the files.
         root: folder to which their paths are relative.
+
+    Raises:
+        BundleError: a name leads outside the stored files, or a description is not a valid URDF.
     """
     base = posixpath.dirname(stored.workcell)
     for reference, package_dirs in references(parse_toml(stored.files[stored.workcell])):
@@ -490,9 +494,8 @@ def parse_toml(content: bytes) -> dict[str, Any]:
 
 
 def references(data: Mapping[str, Any]) -> Iterator[tuple[str, list[str] | None]]:
-    """Yield every path or address by which a workcell file names a file.
-
-    With each comes the list of package folders for a URDF, None for other files.
+    """Yield every path or address by which a workcell file names a file: descriptions of robots,
+    then meshes. With a URDF comes the list of its package folders, with any other file None.
 
     Args:
         data: the tables of the workcell file.

@@ -344,8 +344,8 @@ def _answer(request: Any) -> Any:
 
 
 def _state(paths: Iterable[str]) -> Parts:
-    """Return each path with the digest of the file's content; the digest is empty for a missing
-    file."""
+    """Return each path with the digest of the file's content, to recognise changed files; the
+    digest is empty for a missing file."""
     return tuple((path, _digest(path) if os.path.exists(path) else b"") for path in paths)
 
 
@@ -395,8 +395,12 @@ def main() -> int:
 
 
 def _limit(size: int) -> None:
-    """Set limits on the process's remaining time, file size and memory for an input of `size`
-    bytes."""
+    """Limit what this process may do while it expands a xacro file: its processor time, the size of
+    its output, its memory, and its access to the system (`_refuse_access`).
+
+    Args:
+        size: size of the input [bytes], for which memory is granted.
+    """
     for kind, most in (
         (resource.RLIMIT_CORE, 0),
         (resource.RLIMIT_CPU, CPU_SECONDS),
@@ -469,9 +473,12 @@ def _expand(
 
 
 def _opened(name: str) -> io.StringIO:
-    """Open an included file within the size limits.
+    """Open a file that a xacro file includes.
 
     A missing file raises `FileNotFoundError`, which xacro ignores for an optional include.
+
+    Raises:
+        OutsideError: the file cannot be read or is too large.
     """
     if not os.path.exists(name):
         raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), name)
@@ -482,7 +489,8 @@ def _opened(name: str) -> io.StringIO:
 
 
 def _by_package(address: str, packages: Mapping[str, Path]) -> str:
-    """Return a mesh address with the folder of one of the packages replaced by `package://NAME`.
+    """Return the portable form of a mesh address: the folder of one of the packages is replaced by
+    `package://NAME`. An address in no package is returned unchanged.
 
     Args:
         address: the address.

@@ -45,8 +45,8 @@ def completed(text: str, data: Mapping[str, Any], changes: Changes) -> str:
 
 
 def with_paths(data: Mapping[str, Any], change: Callable[[str], str]) -> Changes:
-    """Return changes of a workcell file that replace the paths of robots, tools, environment and
-    payload.
+    """Return changes of a workcell file that replace every path of a robot, tool, environment or
+    payload file by another path.
 
     Args:
         data: the tables of the workcell file.
@@ -107,12 +107,15 @@ def extended(text: str, data: Mapping[str, Any], key: str, tables: list[dict[str
 def _edited(
     text: str, wanted: Mapping[str, Any], edit: Callable[[tomlkit.TOMLDocument], None]
 ) -> str:
-    """Edit a text, and check the result.
+    """Edit a text, and return it if it then has the wanted content.
 
     Args:
         text: TOML text of the file.
         wanted: content that the edited text has to have.
         edit: function that edits the document.
+
+    Raises:
+        SettingsError: the edited text has another content, because of how the file is written.
     """
     with suppress(OutsideError, TOMLKitError, LookupError, TypeError, ValueError):
         document = tomlkit.parse(text)

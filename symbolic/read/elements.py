@@ -112,8 +112,8 @@ class ElementReader:
         return f"{self.path} {key}".lstrip()
 
     def named(self, tag: str) -> dict[str, ElementReader]:
-        """Return the inner elements with a tag, by their names. A repeated name is recorded as a
-        problem."""
+        """Return the inner elements with a tag, by the value of their attribute `name`. A repeated
+        name is recorded as a problem; the first element with it is returned."""
         found: dict[str, ElementReader] = {}
         for index, element in enumerate(self.element.findall(tag)):
             name = ElementReader(element, f"{self.path}/{tag}[{index}]".lstrip("/"), self.problems)
@@ -141,8 +141,8 @@ class ElementReader:
         return found
 
     def all(self, tag: str) -> list[ElementReader]:
-        """Return a reader of every inner element with a tag, without adding these elements to
-        `kept`."""
+        """Return a reader of every inner element with a tag. These elements do not become part of
+        the copy `kept`."""
         path = f"{self.path}/{tag}".removeprefix("/")
         return [
             ElementReader(element, f"{path}[{index}]", self.problems)
@@ -150,7 +150,8 @@ class ElementReader:
         ]
 
     def one_of(self, tags: Sequence[str]) -> ElementReader:
-        """Return the first inner element; record a problem if its tag is not among `tags`."""
+        """Return the first inner element, whose tag has to be among `tags`. Otherwise record a
+        problem and return a reader that reports nothing further."""
         element = next(iter(self.element), None)
         if element is None or element.tag not in tags:
             found = "nothing" if element is None else shown(element.tag)

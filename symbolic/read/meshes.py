@@ -98,7 +98,13 @@ def _require_few(count: int, most: int, meaning: str) -> None:
 
 
 def _read(path: Path) -> trimesh.Trimesh:
-    """Read the triangles of a file. Only the number of corners is checked."""
+    """Read the triangles of a mesh file in the file's unit. It is not checked here whether they are
+    finite, flat or too large.
+
+    Raises:
+        OutsideError: the file cannot be read as a mesh, has too many words or elements, is empty,
+            or its faces are not triangles.
+    """
     kind = path.suffix.lower().removeprefix(".")
     if kind not in FORMATS:
         raise OutsideError(
@@ -138,7 +144,8 @@ def _read(path: Path) -> trimesh.Trimesh:
 
 
 def _is_text(kind: str, content: bytes) -> bool:
-    """Return True if a mesh file is parsed word by word: an OBJ or OFF, or a PLY in text form.
+    """Return True if the reader of a mesh format splits the file into words, whose number has to be
+    limited: for OBJ, OFF and PLY in text form.
 
     An STL text counts as False, since only its numbers are parsed.
 
@@ -151,8 +158,8 @@ def _is_text(kind: str, content: bytes) -> bool:
 
 
 def _gaps(content: bytes) -> int:
-    """Compute an upper bound of the number of gaps between the words of a text, which may contain
-    spaces beyond ASCII."""
+    """Compute an upper bound of the number of words of a text, without splitting it: the number of
+    bytes that are spaces, control characters or not ASCII."""
     letters = np.frombuffer(content, np.uint8)
     return int(np.count_nonzero((letters <= 32) | (letters >= 128)))
 

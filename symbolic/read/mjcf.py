@@ -47,7 +47,8 @@ def compiled(path: Path) -> Any:
 def geom_shape(
     mujoco: Any, model: Any, geom: int
 ) -> tuple[str, Box | Sphere | Cylinder | Capsule | None]:
-    """Return the kind of a geom, such as 'box', and its shape; None for an unsupported shape.
+    """Return the kind of a geom, such as 'box', and its shape; None in place of the shape for kinds
+    other than box, sphere, cylinder and capsule.
 
     Args:
         mujoco: the module `mujoco`.

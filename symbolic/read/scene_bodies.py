@@ -41,8 +41,12 @@ DIGITS = 12
 
 
 def slab_below(pose: Array) -> tuple[Box, Array]:
-    """Return the box that replaces the half-space below a frame's x-y plane, and its pose (4,
-    4)."""
+    """Return a box that stands for the half-space below a plane, and its pose (4, 4) in the world.
+    The upper face of the box lies in the plane.
+
+    Args:
+        pose: (4, 4) pose in the world of a frame whose x-y plane is the plane.
+    """
     normal = pose[:3, 2]
     middle = normal * (normal @ pose[:3, 3] - SLAB[2] / 2.0)
     return Box(np.array(SLAB)), transform(pose[:3, :3], middle)
@@ -204,7 +208,12 @@ class SceneBuilder:
         self.left_out.append(f"{safe_io.printable(name) or 'scene'}: {why}")
 
     def note(self, name: str, what: str) -> None:
-        """Report in the text `what` how the body `name` differs from the scene."""
+        """Report how a body of the result differs from the scene.
+
+        Args:
+            name: name of the body.
+            what: description of the difference.
+        """
         self.notes.append(f"{safe_io.printable(name) or 'scene'}: {what}")
 
     def _name(self, name: str) -> str:
@@ -266,12 +275,11 @@ _VARIABLES = ("GZ_SIM_RESOURCE_PATH", "GAZEBO_MODEL_PATH", "SDF_PATH")
 
 
 def file_at(address: str, file: Path) -> Path | None:
-    """Return the file behind an address in a scene; None if it does not exist.
-
-    If the address is a model's folder, return the description of the model.
+    """Return the file behind an address in a scene; None if it does not exist. For the address of a
+    model's folder it is the model's description.
 
     Args:
-        address: the address.
+        address: a path relative to the scene's file, or an address file://, model:// or package://.
         file: the scene's file.
     """
     scheme, _, rest = address.rpartition("://")

@@ -106,7 +106,11 @@ class _Scope:
         self.frames[name] = (base, pose)
 
     def frame(self, name: str) -> Array:
-        """Compute the pose (4, 4) of a named frame in the frame of the world or model."""
+        """Compute the pose (4, 4) of a named frame relative to this world or model.
+
+        Raises:
+            OutsideError: the frame does not exist, or depends on itself.
+        """
         T_name, met = np.eye(4), 0
         while name not in (*OWN, "world") or (name == "world" and self.part.tag == "model"):
             head, _, rest = name.partition("::")
@@ -372,8 +376,14 @@ def _read_moveit(path: Path, found: SceneBuilder) -> None:
 def _object(
     table: TableReader, frames: Mapping[str, Array], path: Path, found: SceneBuilder
 ) -> None:
-    """Add a collision object of a planning scene, from its `table`, to `found`: primitives, meshes,
-    planes. The poses (4, 4) in `frames` are those of named frames in the world; `path` is the file.
+    """Add a collision object of a planning scene: its primitives, meshes and planes.
+
+    Args:
+        table: table of the object.
+        frames: poses (4, 4) in the world of named frames, to which the object's pose may be
+            relative.
+        path: file of the scene.
+        found: collector of bodies.
     """
     name = str(table.raw("id", "") or "object")
     if table.raw("operation", None) not in _ADDED:
@@ -414,9 +424,13 @@ _PLACES = {"primitives": "primitive_poses", "meshes": "mesh_poses", "planes": "p
 
 
 def _frame(table: TableReader, place: str = "position", turn: str = "orientation") -> Array:
-    """Read a pose (4, 4) from a position and a quaternion; a missing one is zero.
+    """Read a pose (4, 4) from a position and a quaternion. A missing position is zero, a missing
+    quaternion means no rotation.
 
-    Each is a table with the keys x, y, z (and w), or an array, at the keys `place` and `turn`.
+    Args:
+        table: table with both.
+        place, turn: keys of position and quaternion. The value of each is a table with the keys x,
+            y, z (and w), or an array in this order.
     """
     parts = []
     for key, letters in ((place, "xyz"), (turn, "xyzw")):
@@ -455,8 +469,15 @@ def _primitive(name: str, kind: str, sizes: Array, pose: Array, found: SceneBuil
 def _moveit_mesh(
     name: str, table: TableReader, pose: Array, path: Path, found: SceneBuilder
 ) -> None:
-    """Add a mesh with the pose (4, 4) in the world to `found`. Its `table`, in the file `path`,
-    states an address or triangles."""
+    """Add a mesh of a planning scene, which is stated by an address or by its triangles.
+
+    Args:
+        name: name of the body.
+        table: table of the mesh.
+        pose: (4, 4) in the world.
+        path: file of the scene.
+        found: collector of bodies.
+    """
     if table.has("resource"):
         scale = table.vector("dimensions", (ANY,) * 3, (1.0, 1.0, 1.0))
         found.mesh(name, str(table.raw("resource")), path, scale, pose)
@@ -476,7 +497,15 @@ def _moveit_mesh(
 
 
 def _triangles(name: str, vertices: Any, faces: Any, pose: Array, found: SceneBuilder) -> None:
-    """Add a mesh, at `pose` (4, 4) in the world, from lists of vertices [m] and vertex indices."""
+    """Add a mesh that is stated by its triangles.
+
+    Args:
+        name: name of the body.
+        vertices: list of n vertices, three numbers each [m].
+        faces: list of triangles, three indices of vertices each.
+        pose: (4, 4) in the world.
+        found: collector of bodies.
+    """
     try:
         places = np.array(vertices, dtype=float).reshape(-1, 3)
         corners = np.array(faces, dtype=float).reshape(-1, 3)

@@ -260,8 +260,10 @@ def _array(each: Schema | Sequence[Schema], least: int = 0, most: int | None = N
     """Return the schema of an array.
 
     Args:
-        each: one schema for all entries, or a sequence with one schema per entry.
-        least, most: bounds of the number of entries, for one schema; most None for no bounds.
+        each: one schema for all entries; or a sequence with one schema per entry, which fixes the
+            number of entries.
+        least, most: bounds of the number of entries, if `each` is one schema. If `most` is None,
+            neither bound applies.
     """
     if not isinstance(each, dict):
         sizes = {"minItems": len(each), "maxItems": len(each)}

@@ -145,8 +145,8 @@ class TableReader:
         return _stand_in(kind) if default is _REQUIRED else default
 
     def number(self, key: str, allowed: Range, default: float | None = None) -> float:
-        """Read the number at a key within the range `allowed`. Without a default a missing key is a
-        problem."""
+        """Read the number at a key, which has to be in the range `allowed`. A missing key gives
+        `default`; without a default it is a problem. After a problem return 1."""
         found: float = self.value(
             key, Annotated[float, allowed], _REQUIRED if default is None else default
         )
@@ -159,13 +159,16 @@ class TableReader:
         default: Sequence[float] | Array | None = None,
         filling: bool = False,
     ) -> Array:
-        """Read an array of numbers.
+        """Read an array of numbers; after a problem a valid placeholder.
 
         Args:
             key: key of the array.
-            allowed: range of each entry.
+            allowed: range of each of the n entries.
             default: the array for a missing key; None if the key is required.
             filling: True if the file may state one number for all entries.
+
+        Returns:
+            Array (n,), read-only.
         """
         value = self.raw(key, _REQUIRED if default is None else list(default))
         if value is None and (default is not None or key not in self):
@@ -173,7 +176,8 @@ class TableReader:
         return checked_vector(value, allowed, self.at(key), self.problems, filling)
 
     def integer(self, key: str, low: int, high: int, default: int) -> int:
-        """Read the integer from `low` to `high` at a key; `default` if the key is missing."""
+        """Read the integer at a key, which has to be from `low` to `high`; `default` if the key is
+        missing, `low` after a problem."""
         found: int = self.value(key, Annotated[int, Range(low, high)], default)
         return found
 
@@ -220,12 +224,12 @@ class TableReader:
         return TableReader({}, self.at(key), Problems())
 
     def tables(self, key: str, exactly: int | None = None) -> list[TableReader]:
-        """Read an array of tables.
+        """Read an array of tables; an empty list after a problem with its type.
 
         Args:
             key: key of the array.
-            exactly: required number of tables, of which no more are returned; None for an optional
-                array of any length.
+            exactly: required number of tables; another number is a problem, and no more than these
+                are returned. None for an optional array of any length.
         """
         value = self.raw(key, [] if exactly is None else _REQUIRED)
         if value is None:
@@ -528,7 +532,8 @@ def read_body(table: TableReader, folder: Path) -> Body:
 def read_file(
     table: TableReader, key: str, folder: Path, most: int, at: Path | None = None
 ) -> Path:
-    """Return the absolute path of a readable file named relative to `folder`.
+    """Read the name of a file, check that the file can be read, and return its absolute path. After
+    a problem return `folder`.
 
     Args:
         table, key: table and key that name the file.
@@ -553,7 +558,8 @@ def read_file(
 
 
 def read_inertia(table: TableReader, bound: float, allowed: str = "a 3 x 3 matrix") -> Array:
-    """Read the (3, 3) matrix of the key `inertia` [kg m^2] of a rigid body.
+    """Read the (3, 3) matrix of the key `inertia` [kg m^2], which has to be the inertia of a rigid
+    body. After a problem return a matrix that need not be one.
 
     Args:
         table: table with the key.
