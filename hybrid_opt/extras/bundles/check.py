@@ -355,9 +355,8 @@ def check(
 
 
 def _places(time: Array) -> Array:
-    """Return ascending times [s]: those of the n samples, and in each step between two samples the
-    times at the shares `BETWEEN` of the step.
-    """
+    """Return the times [s] at which a trajectory is checked: those of the n samples and, in each
+    step between two samples, those at the shares `BETWEEN` of the step. They ascend."""
     steps = np.diff(time)
     inside = [time[:-1] + share * steps for share in (0.0, *BETWEEN)]
     return np.append(np.column_stack(inside).ravel(), time[-1])

@@ -402,8 +402,11 @@ class Export:
 
     @cached_property
     def partner_stop(self) -> PartnerStop:
-        """Effect of an unplanned stop of one arm on the distance of the pads; a JobError if they
-        would move farther apart than the cell allows."""
+        """Effect of an unplanned stop of one arm on the distance of the pads.
+
+        Raises:
+            JobError: the pads would move farther apart than the cell allows.
+        """
         job, k, time = self.job, self.stiffness, self.limits.partner_stop_time
         survived = None if k is None else separation(job, largest_skew(job, k, time))
         allowed = self.workcell.handling.partner_stop

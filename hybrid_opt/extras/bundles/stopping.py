@@ -47,7 +47,14 @@ class Stop:
 
 def stop_of(job: Job, model: TimingModel) -> Stop:
     """Find the shortest stop along the path that the commanded forces allow at every point of a
-    job, by the timing model of its workcell.
+    job.
+
+    If one of the stops that they allow also keeps joint accelerations low enough, the shortest such
+    stop is the usual one, and the shortest of all is the quick one.
+
+    Args:
+        job: the job.
+        model: timing model of the job's workcell.
 
     Raises:
         JobError: the commanded forces allow no stop of the tried durations.
@@ -66,9 +73,11 @@ def stop_of(job: Job, model: TimingModel) -> Stop:
     places, x = time[::STOP_STRIDE], np.linspace(0.0, 1.0, INSTANTS)
 
     def stop(duration: float) -> Stop:
-        """Simulate stops of a given duration [s] that begin at many points of the path. Return the
-        largest normal force and joint acceleration of all these stops, as shares of the commanded
-        force and of the limit.
+        """Simulate stops of a given duration [s] that begin at many points of the path.
+
+        Returns:
+            Record with the largest values over all these stops: normal force over commanded force,
+            and joint acceleration over its limit.
         """
         rate = 1.0 - x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
         slope = -30.0 * x**2 * (1.0 - x) ** 2 / duration

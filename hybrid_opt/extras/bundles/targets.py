@@ -96,7 +96,12 @@ class Target:
         return [*found, partial(self.require_equipment, workcell, leader)]
 
     def refuse(self, job: Job, name: str, any_arm: bool) -> None:
-        """Check, before a job is sampled, that this target can run it, by `checks` and `require`.
+        """Check, before a job is sampled, that this target can run it.
+
+        Args:
+            job: the job.
+            name: name of the target, for messages.
+            any_arm: True to accept arms that do not look like those of the target's maker.
 
         Raises:
             SettingsError: the arms are not of the target's maker, or lack something that it needs.

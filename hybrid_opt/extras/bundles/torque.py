@@ -114,7 +114,10 @@ def driver_of(workcell: Workcell) -> str:
 
 def require_torque(job: Job) -> None:
     """Check, for Franka arms, that the joints have the names that franka_ros2 uses, and that
-    prefixes end with '_'.
+    prefixes end with '_'. Other arms always pass.
+
+    Raises:
+        SettingsError: a name or a prefix is wrong, or no driver takes torques for these arms.
     """
     if driver_of(job.workcell) != "franka":
         return
@@ -288,7 +291,8 @@ def joint_inertia(job: Job) -> Array:
 
 
 def _values(export: Export, arm: int) -> dict[str, Any]:
-    """Return the values of the placeholders that the templates of all makers have, by name."""
+    """Return the values of the placeholders that are common to the templates of all makers, by
+    name."""
     robot, prefix = export.workcell.robots[arm], prefixes(export.workcell)[arm]
     mass, centre = export.tool_load(arm)
     spaces = [prefix.rstrip("_") for prefix in prefixes(export.workcell)]
@@ -349,8 +353,12 @@ def _franka_type(joints: Sequence[str]) -> str:
 
 
 def _contact(job: Job, arm: int) -> tuple[Array, tuple[float, float]]:
-    """Compute the largest torque (n_joints,) of an arm's joints by its contact with the box [N m,
-    for sliding joints N], and the largest force [N] and moment [N m] at its pad."""
+    """Compute the largest load of an arm by its contact with the box.
+
+    Returns:
+        - Largest torque (n_joints,) of each joint [N m, for sliding joints N].
+        - Largest force [N] and largest moment [N m] at the pad.
+    """
     first = len(job.joint_names[0])
     span = slice(0, first) if arm == 0 else slice(first, None)
     torque = [np.abs(p.motion.contact_effort(p.force.wrench)[:, span]).max(0) for p in job.phases]

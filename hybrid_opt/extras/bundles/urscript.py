@@ -88,8 +88,8 @@ def urscript_files(export: Export) -> dict[str, str | bytes]:
     """Return the URScript programs of both arms, as texts by path.
 
     Raises:
-        SettingsError: the time step is not a multiple of the controller's cycle that fills every
-            phase, or there are too many points.
+        SettingsError: the time steps are unequal or no multiple of the controller's cycle, or there
+            are too many points.
     """
     steps = np.diff(export.sampled.time)
     cycles = float(steps.mean()) / CYCLE

@@ -224,8 +224,13 @@ class Job:
         return found
 
     def linear(self, arm: int, name: str, s: float) -> list[float]:
-        """Interpolate values of an arm linearly between samples. `name` is their key in the arm's
-        part of the document, which also decides their unit.
+        """Interpolate values of an arm linearly between samples.
+
+        Args:
+            arm: index of the arm.
+            name: key of the values in the arm's part of the document, which also decides their
+                unit.
+            s: planned time [s].
         """
         k, x, _ = self._place(s)
         rows = self.robots[arm][name]
@@ -267,8 +272,8 @@ class Job:
         return float(sum(r * abs(v) for r, v in zip(reach, rates, strict=True)))
 
     def _project(self, arm: int, q: Sequence[float], s: float) -> float:
-        """Estimate the planned time at which an arm's path is nearest to a posture [s], by one
-        Gauss-Newton step from s."""
+        """Estimate the planned time [s] at which an arm's planned posture is nearest to a measured
+        posture q, by one Gauss-Newton step from the planned time s."""
         planned, rates = self.position(arm, s), self.linear(arm, "velocity", s)
         rows = zip(self.robots[arm]["reach"], q, planned, rates, strict=True)
         fit = [(r * r * (a - b) * v, r * r * v * v) for r, a, b, v in rows]

@@ -25,7 +25,12 @@ from hybrid_opt.extras.bundles.programs.carry_machine import Machine, Seen
 
 
 def options_of(description: str | None, arguments: Sequence[str] | None) -> Namespace:
-    """Read the options of a program: check only, move without a box, or measure both arms."""
+    """Read the options of a program from its command line: --check, --in-air or --bring-up.
+
+    Args:
+        description: description of the program in its help.
+        arguments: arguments of the command line; None for those of this process.
+    """
     parser = ArgumentParser(description=description)
     group = parser.add_mutually_exclusive_group()
     for name, text in (
@@ -63,7 +68,7 @@ class Carry:
         self.fault, self.lost, self.command, self.log = "", False, "", log
 
     def take(self, job: Job) -> None:
-        """Store a job to be run next."""
+        """Store the job that is to run next, and begin at its start."""
         raise NotImplementedError
 
     def seen(self) -> Seen:
@@ -75,7 +80,7 @@ class Carry:
         raise NotImplementedError
 
     def prepare(self) -> None:
-        """Do what has to be done once before the arms move."""
+        """Make the controllers ready, once before the arms move. The default does nothing."""
 
     def check(self) -> None:
         """Raise a `Refused` if an arm is not ready for the job."""
@@ -86,7 +91,11 @@ class Carry:
         self.machine.start(self.seen())
 
     def go_on(self, direction: float) -> None:
-        """Command what lies ahead of a job that continues, 1 forward or -1 back."""
+        """Send the commands of a job that continues. The default does nothing.
+
+        Args:
+            direction: 1 forward, -1 back.
+        """
 
     def status(self) -> str:
         """Return a text that says in which state the job is."""
@@ -109,7 +118,7 @@ class Carry:
         self.log.error(self.status())
 
     def obey(self) -> None:
-        """Continue a job that is held, if somebody has said so."""
+        """Continue a held job if the operator's last word is 'continue' (forward) or 'back'."""
         if self.machine.state == "held" and self.command in ("continue", "back"):
             direction = 1.0 if self.command == "continue" else -1.0
             self.command, self.fault, self.lost = "", "", False
@@ -121,8 +130,15 @@ class Carry:
                 self.go_on(direction)
 
     def drive(self, part: Job, word: str) -> bool:
-        """Run a part of the job to its end and back, after somebody has said a word. Return True
-        if this run was completed."""
+        """Run a job to its end and back.
+
+        Args:
+            part: the job, or a part of it.
+            word: word that the operator has to enter before the arms move; '' to begin without one.
+
+        Returns:
+            True if the arms are back at the beginning.
+        """
         self.take(part)
         self.log.info(BLOCK if word else AIR)
         while self.command != word and not self.fault:
@@ -137,7 +153,12 @@ class Carry:
         return self.look_after() == BACK
 
     def look_after(self) -> int:
-        """Supervise the started job until it ends. Return the exit code of the program."""
+        """Supervise the started job until it ends.
+
+        Returns:
+            0 if the job is done, `BACK` if the arms are back at its beginning, 1 if the operator
+            has left while the job was held.
+        """
         while self.machine.state != "done":
             self.cycle()
             if self.machine.state == "held" and self.command == "leave":
@@ -149,14 +170,19 @@ class Carry:
 def run(
     options: Namespace, folder: Path, config: dict[str, Any], make: Callable[..., Carry], log: Any
 ) -> int:
-    """Run the job of a bundle, or measure its arms. Return the exit code, 0 when the job is done.
+    """Run the job of a bundle, or measure its arms.
 
     Args:
-        options: options of the program.
+        options: options of the program, from `options_of`.
         folder: folder of the bundle.
         config: settings of the bundle, of which `plan` is read.
-        make: function that takes the job, the settings, what is known of the arms, and `log`.
-        log: where messages go, with the methods `info` and `error`.
+        make: class or function that makes the run from the job, the settings, the measured
+            properties of both arms (or a store of measurements), and `log`.
+        log: logger with the methods `info` and `error`.
+
+    Returns:
+        Exit code of the program: 0 when the job is done, 2 if it was refused, else as in
+        `Carry.look_after`.
     """
     looks, plan = Looks(), config["plan"]
     try:

@@ -65,7 +65,12 @@ class Press:
     """
 
     def __init__(self, config: dict[str, Any]) -> None:
-        """Start with a pad at its planned position, with the settings `press` of the bundle."""
+        """Start with the pad at its planned position.
+
+        Args:
+            config: settings `press` of the bundle: gain of the integral, largest depth [m] and
+                speed [m/s], and compliance of both arms [m/N].
+        """
         self.way = 0.0
         self._missing = 0.0
         self._gain, self._most = config["gain"], config["most"]
@@ -115,7 +120,16 @@ class Stream(Carry):
         log: Any,
         sockets: Sequence[socket.socket] = (),
     ) -> None:
-        """Prepare to wait for both controllers at a UDP socket each."""
+        """Prepare to answer both controllers. Nothing is sent before they begin.
+
+        Args:
+            job: the job to run.
+            config: content of config/egm.json.
+            known: measured properties of both arms; or a store of measurements if they are to be
+                measured.
+            log: logger with the methods `info` and `error`.
+            sockets: bound UDP socket for each arm's controller.
+        """
         super().__init__(known, log)
         self.config = config
         self._arm: int = config["press"]["arm"]
@@ -130,7 +144,7 @@ class Stream(Carry):
         self.take(job)
 
     def take(self, job: Job) -> None:
-        """Store a job to be run next."""
+        """Store the job that is to run next, and begin at its start."""
         self.job = job
         sensors = self.config["sensors"] if self.signs else (False, False)
         self.machine = Machine(job, 0.0, sensors=sensors)
@@ -206,7 +220,8 @@ class Stream(Carry):
         return super().status() + (strange if self.dropped else "")
 
     def cycle(self) -> None:
-        """Answer what both controllers have sent, and take words from the terminal."""
+        """Handle both controllers' messages for a short time: store the measured states, advance
+        the job, and answer with commands. Read a word of the operator from the terminal."""
         ready, _, _ = select.select(self._waiting, [], [], 0.01)
         now = time.monotonic()
         heard: dict[int, tuple[FromRobot, Any]] = {}
@@ -241,7 +256,11 @@ class Stream(Carry):
             self.log.info(self.status())
 
     def _press(self, dt: float, seen: Seen) -> None:
-        """Move the pressing pad for one time step, by the measured force."""
+        """Move the pressing pad for one time step of dt [s].
+
+        Usually the measured force controls the motion; while the arms are measured, the pad creeps
+        instead and the readings are stored.
+        """
         clock, is_running = self.machine.clock, self.machine.state == "running"
         soon = clock.s + clock.rate * self.config["lags"][self._arm]
         wanted, later = (self.job.force(self._arm, s) for s in (clock.s, soon))
@@ -264,8 +283,16 @@ class Stream(Carry):
             self.fail(f"{name} presses {felt:.1f} N instead of {wanted:.1f} N", lost=True)
 
     def answer(self, arm: int, number: int, now: float) -> bytes:
-        """Encode the message that commands an arm's joint positions: those that the path reaches
-        one delay of the arm later."""
+        """Encode the message that commands an arm's joint positions.
+
+        To compensate the delay of the arm, it commands the positions that the path reaches one
+        delay later.
+
+        Args:
+            arm: index of the arm.
+            number: number of the message.
+            now: time of the message [s].
+        """
         clock, first = self.machine.clock, self._first[arm]
         if self.machine.state == "ready" and first is not None:
             q = first
@@ -290,9 +317,18 @@ class Stream(Carry):
     def _in_chain(
         self, arm: int, joints: Sequence[float], further: Sequence[float]
     ) -> list[float] | None:
-        """Return an arm's joint positions in the order of its joints, base first [degrees], from
-        those of the robot's axes and of the external axes; None if their number is wrong. ABB
-        counts the third of seven joints as an external axis."""
+        """Convert an arm's joint positions from ABB's order to the order of its joints, base first.
+
+        ABB counts the third of seven joints as an external axis.
+
+        Args:
+            arm: index of the arm.
+            joints: positions of the robot's axes [degrees].
+            further: positions of the external axes [degrees].
+
+        Returns:
+            Joint positions [degrees]; None if their number is wrong.
+        """
         count = len(self.job.robots[arm]["joints"])
         if len(joints) < 6 or (count == 7 and not further):
             return None
@@ -440,8 +476,14 @@ def _as_varint(value: int) -> bytes:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Stream the job by the arguments of the command line. Return the exit code, 0 when it is
-    done."""
+    """Run the bundle's program for EGM.
+
+    Args:
+        arguments: arguments of the command line; None for those of this process.
+
+    Returns:
+        Exit code, as in `run`.
+    """
     options = options_of(__doc__, arguments)
     logging.basicConfig(level=logging.INFO, format="%(message)s")
     log = logging.getLogger()

@@ -98,7 +98,16 @@ class Run(Carry):
         log: Any,
         node: Any,
     ) -> None:
-        """Subscribe to both arms by a ROS node; nothing is sent yet."""
+        """Subscribe to the state of both arms; nothing is sent yet.
+
+        Args:
+            job: the job to run.
+            config: content of config/cell.json.
+            known: measured properties of both arms; or a store of measurements if they are to be
+                measured.
+            log: logger with the methods `info` and `error`.
+            node: ROS node of the program.
+        """
         super().__init__(known, log)
         self.node, self.config = node, config
         self._grips: list[dict[str, Any] | None] = config.get("grip", [None, None])
@@ -130,7 +139,7 @@ class Run(Carry):
         }
 
     def take(self, job: Job) -> None:
-        """Store a job to be run next."""
+        """Store the job that is to run next, and begin at its start."""
         sensors = [source is not None and self.looks is None for source in self.config["wrench"]]
         inputs = [bool(grip and grip["input"]) for grip in self._grips]
         self.job = job
@@ -180,7 +189,8 @@ class Run(Carry):
         return float(self.node.get_clock().now().nanoseconds) * 1e-9
 
     def seen(self) -> Seen:
-        """Return the measured state of the arms now. A service that has refused is a fault."""
+        """Return the measured state of the arms now. If a service has refused a call, the state has
+        this as its fault."""
         for name, future in [call for call in self._calls if call[1].done()]:
             answer = future.result()
             if not getattr(answer, "ok", getattr(answer, "success", answer is not None)):
@@ -206,7 +216,8 @@ class Run(Carry):
         )
 
     def _raw(self, now: float) -> list[float | None]:
-        """Return the reading of each arm's sensor [N]; None without a recent one."""
+        """Return the reading of each arm's force sensor at the time `now` [s], in newtons; None if
+        the last one is too old."""
         both, silence = zip(self._force, self._felt, strict=True), self.job.limits.silence
         return [force if now - then <= silence else None for force, then in both]
 
@@ -280,8 +291,15 @@ class Run(Carry):
         super().check()
 
     def send(self, moments: Sequence[Moment], begin: float) -> None:
-        """Send each controller its part of the path, whose first state is reached at the time
-        `begin` [s]. Wait until it is accepted, or raise a `Refused`."""
+        """Send the coming motion to the controllers, and wait until all accept it.
+
+        Args:
+            moments: future states of the job on its path.
+            begin: time of the first state, on the clock of the node [s].
+
+        Raises:
+            Refused: a controller does not accept its part, or does not answer.
+        """
         goals = [self._goal(group["arms"], moments, begin) for group in self.config["groups"]]
         # Large goals take long to build: none is sent before all are there.
         both = zip(self._actions.values(), goals, strict=True)
@@ -352,7 +370,11 @@ class Run(Carry):
         self._last = self._began
 
     def go_on(self, direction: float) -> None:
-        """Send what lies ahead of a job that continues, and start it."""
+        """Send the motion of a job that continues, and start it.
+
+        Args:
+            direction: 1 forward, -1 back.
+        """
         try:
             self._begin(direction)
         except Refused as error:
@@ -395,7 +417,8 @@ class Run(Carry):
             self.log.error(f"{error}; its arm goes on as it was last told")
 
     def look_after(self) -> int:
-        """Supervise the started job until it ends; stop both arms if this program fails."""
+        """Supervise the started job until it ends; stop both arms if this program fails. Return the
+        exit code, as in `Carry.look_after`."""
         try:
             return super().look_after()
         except BaseException:
@@ -406,7 +429,14 @@ class Run(Carry):
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the job by the arguments of the command line. Return the exit code, 0 when it is done."""
+    """Run the bundle's program for ROS 2.
+
+    Args:
+        arguments: arguments of the command line; None for those of this process.
+
+    Returns:
+        Exit code, as in `run`.
+    """
     options = options_of(__doc__, arguments)
     rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
     config = json.loads((BUNDLE / "config/cell.json").read_text("utf-8"))
