@@ -89,7 +89,8 @@ class ArmMotion:
 
     @property
     def torque(self) -> Array:
-        """(n, n_joints) joint torques of the arm and the contact wrench together [N m]."""
+        """(n, n_joints) total joint torques [N m]: those of the bare arm's motion and weight, and
+        those of the contact wrench."""
         return self.contact_torque + self.own_torque
 
 

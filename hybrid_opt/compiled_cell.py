@@ -95,7 +95,8 @@ class CompiledCell:
 
     @cached_property
     def model(self) -> CellModel:
-        """The symbolic model of the cell.
+        """The symbolic model of the cell with the values of its parameters; in `symbols` they are
+        symbols.
 
         Raises:
             DualArmError: the model cannot be built.
@@ -170,7 +171,8 @@ class CompiledCell:
 
     @cached_property
     def symbols(self) -> CellModel:
-        """Symbolic model of the cell, whose functions take the cell's parameters as inputs."""
+        """The symbolic model of the cell with symbols for its parameters, which are inputs of its
+        functions; in `model` they have values."""
         return self.numbers.symbolic(self.bodies)
 
     @cached_property

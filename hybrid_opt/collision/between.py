@@ -216,10 +216,12 @@ class _Sweep:
         return self.required[owners]
 
     def _given_up(self, work: Intervals, level: int) -> NDArray[np.bool_]:
-        """Return a mask (m,), True for each interval that stays undecided.
+        """Return a mask (m,), True for each interval that is not halved further and stays
+        undecided.
 
-        At the last level all intervals stay undecided. From `HOPELESS_DEPTH` on an interval does if
-        at one of its ends a pair is closer than required, so that no proof can succeed.
+        These are all intervals at the last level. From the level `HOPELESS_DEPTH` on, these are
+        also intervals at one end of which a pair is closer than required, since then no proof can
+        succeed.
 
         Args:
             work: the m intervals.

@@ -242,8 +242,8 @@ def _(found: Sensitivities) -> str:
 
 @figures_of.register
 def _(found: Sensitivities) -> dict[str, str]:
-    """Format the changes of force and duration if each number of the file changes by a usual
-    amount."""
+    """Format for each number of the workcell file the changes of force and duration that a usual
+    change of this number causes. How much is usual depends on its unit."""
     return {f"{row.key} = {row.value:g} {row.unit}".rstrip(): _changes(row) for row in found.rows}
 
 

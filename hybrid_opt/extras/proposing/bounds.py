@@ -89,12 +89,13 @@ class Sampling:
     out_of_time: Callable[[], bool]
 
     def bounds_around(self, carry: Array) -> Bounds:
-        """Find bounds such that the wanted share of random candidates between them is feasible.
+        """Find bounds of the decision vector such that the wanted share of random candidates
+        between them is feasible.
 
-        One common factor of the half-widths is bisected. Between bisections the bounds move to the
-        mean of the feasible candidates, which allows wider bounds. The result's carry is the given
-        one if it lies within the bounds and is certified. Otherwise it is a carry between the given
-        one and the middle of the bounds.
+        All half-widths are multiplied by one factor, which is bisected. Between bisections the
+        bounds move to the mean of the feasible candidates, which allows wider bounds. The result
+        also has a certified carry within the bounds: the given one if possible, otherwise one
+        between it and the middle of the bounds.
 
         Args:
             carry: (n_var,) feasible decision vector.

@@ -100,8 +100,11 @@ class MachineKinematics:
         return q
 
     def drawn(self, count: int, rng: np.random.Generator) -> Array:
-        """Draw random postures (count, size) [rad or m]: common joints between their rest and a
-        random position, all others uniform between their limits."""
+        """Draw random postures (count, size) [rad or m].
+
+        Joints of one arm are uniform between their limits. Common joints are, by a random share,
+        between such a position and their position at rest.
+        """
         x = rng.uniform(self.lower, self.upper, (count, len(self.rest)))
         x[:, : self.common] += rng.random((count, 1)) * (self.rest - x)[:, : self.common]
         return x
@@ -109,11 +112,11 @@ class MachineKinematics:
     def solve(
         self, x: Array, targets: Sequence[Array], steps: int, damping: float = 0.0
     ) -> tuple[Array, Array, Array]:
-        """Find postures that put the last joint of both arms at given poses. Joints do not leave
+        """Find postures that put the last joint of both arms at given poses. Joints stay within
         their limits.
 
-        Newton steps have least norm; the first ones also drift to the posture `rest`, as far as the
-        poses leave the joints free.
+        The postures follow from Newton steps of least norm. In all but the last steps, joint motion
+        that does not change the poses moves the postures towards `rest`.
 
         Args:
             x: (n, size) initial postures [rad or m].

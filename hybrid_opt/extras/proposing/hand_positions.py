@@ -47,9 +47,9 @@ Entry = dict[str, Any]
 
 
 def pattern_entry(entry: Entry, thickness: float) -> Entry:
-    """Complete the table of a contact in a file by positions and normals of its hands.
+    """Return the table of a contact in a file, with positions and normals of all its hands added.
 
-    They are stated in the frame of the first hand, whose z axis points into the payload.
+    They are in the frame of the first hand, whose z axis points into the payload.
 
     Args:
         entry: table of the contact in the problem file, without `xyz`. The `xyz` of the hands in

@@ -143,21 +143,23 @@ class HoldMap:
 
     @property
     def holds(self) -> NDArray[np.bool_]:
-        """(l, ny, nx, w) True for box poses at which both arms hold the box."""
+        """(l, ny, nx, w) True for box poses, by height, y, x and direction, at which both arms can
+        hold the box."""
         return np.asarray(self.state == PoseState.HOLDS)
 
     @property
     def directions(self) -> NDArray[np.intp]:
-        """(l, ny, nx) number of directions of the box in which both arms can hold it, at each
-        position.
-        """
+        """(l, ny, nx) number of directions in which both arms can hold the box, by height, y and x
+        of its centre."""
         return np.asarray(self.holds.sum(axis=-1))
 
     @cached_property
     def _quality(self) -> Array:
-        """(l, ny, nx, w) comfort of the postures, times the distance in grid steps to the nearest
-        position at the same height at which the box cannot be held in the same direction; 0 at
-        poses that cannot be held.
+        """(l, ny, nx, w) quality of box poses, by height, y, x and direction.
+
+        It is the comfort of the postures times the distance, in grid steps, to the nearest position
+        at the same height at which the box cannot be held in the same direction; 0 at poses that
+        cannot be held.
         """
         inside = np.pad(self.holds, ((0, 0), (1, 1), (1, 1), (0, 0)))
         depth = np.zeros(inside.shape)
@@ -168,8 +170,9 @@ class HoldMap:
     def best(self, level: int | None = None) -> HeldPose | None:
         """Return the best box pose that both arms can hold; None if there is none.
 
-        It maximises the comfort of the postures times the distance to the nearest position at which
-        the box cannot be held in the same direction.
+        It maximises the comfort of the postures (their distance from joint limits and singular
+        postures) times the distance to the nearest position at which the box cannot be held in the
+        same direction.
 
         Args:
             level: index of the height; None for all heights.
@@ -310,10 +313,13 @@ class _GridSearch:
         self._done, self._total = 0, len(commons) * len(self.ways) * levels
 
     def searched(self, x: Array, y: Array, z: Array) -> PoseSearch:
-        """Search on a grid. Poses are sorted by height, y, x and direction.
+        """Find for each pose of a grid a way in which both arms can hold the box there.
 
         Args:
             x, y, z: (nx,), (ny,), (l,) coordinates of the box centre [m].
+
+        Returns:
+            The finished search, with poses sorted by height, y, x and direction.
         """
         parts = np.meshgrid(z, y, x, np.arange(len(self.yaws)), indexing="ij")
         up, across, along, which = (part.ravel() for part in parts)
@@ -340,9 +346,11 @@ class _GridSearch:
         return x, y, z
 
     def fine_grid(self) -> Grid:
-        """Choose a finer grid of round numbers about those positions of the coarse grid at which
-        the box can be held. If there are none, the grid is about the positions that both arms
-        reach, or else about all positions.
+        """Choose a finer grid around the promising positions of the coarse grid. Its coordinates
+        are multiples of a round step.
+
+        Promising are positions at which the box can be held. If there are none, they are those that
+        both arms reach, though with collisions; if there are none of these either, all positions.
         """
         coarse = self.coarse_grid()
         state = self.searched(*coarse).state.reshape(*COARSE_GRID[::-1], -1)
@@ -377,9 +385,8 @@ def _multiples(low: float, high: float, step: float) -> Array:
 def _common_positions(
     arms: Sequence[ArmKinematics], rng: np.random.Generator
 ) -> list[Array | None]:
-    """Return a list of positions (k,) to try for the k joints that move both arms [rad or m];
-    [None] if there are no such joints.
-    """
+    """Return positions (k,) to try for the k joints that move both arms [rad or m]: the rest
+    position, then random ones. Without such joints the result is [None]."""
     if not arms[0].common:
         return [None]
     machine = MachineKinematics(arms)

@@ -90,7 +90,8 @@ class WayToHold:
     """
 
     def __init__(self, contacts: list[dict[str, Any]], bodies: CellBodies, spins: Array) -> None:
-        """Prepare both arms.
+        """Prepare both arms, and keep the rotations of each pad with which its tool does not enter
+        the payload.
 
         Args:
             contacts: tables of both contacts as they stand in a file.
@@ -138,15 +139,17 @@ class WayToHold:
 
 
 def ways_to_hold(problem: Problem, spins: Array) -> Iterator[WayToHold]:
-    """Yield the ways that `propose` tries to hold the box, the most promising first, without those
-    in which the payload cannot be held at rest or a tool enters it.
+    """Yield the ways that `propose` tries to hold the box, the most promising first.
+
+    Ways in which the payload cannot be held at rest, or in which a tool enters it, are left out.
 
     Args:
         problem: the problem, with bases.
         spins: (n,) rotations of the pads about their normals that are tried [rad].
 
     Raises:
-        DualArmError: the file is wrong, or no way is left; the message is that of the first way.
+        DualArmError: the file is wrong, or the payload cannot be held at rest in any way; the
+            message is the one for the first way.
     """
     known: CellBodies | None = None
     refused: DualArmError | None = None
@@ -171,7 +174,8 @@ class PostureLibrary:
     """Random usable postures of one arm, to be found by the pose of its pad."""
 
     def __init__(self, arm: ArmKinematics, q: Array) -> None:
-        """Keep the postures within joint limits and away from singular ones.
+        """Store those of the given postures that are within joint limits and not close to singular
+        ones.
 
         Args:
             arm: the arm.
@@ -241,7 +245,11 @@ class ReachedPoses:
 def reached_poses(
     arm: ArmKinematics, library: PostureLibrary, spins: Array, T_world_box: Array
 ) -> ReachedPoses:
-    """Find usable postures with which an arm reaches its contact, at n box poses.
+    """Find postures with which an arm reaches its contact, at n box poses. Collisions are not
+    checked.
+
+    Newton's method starts at stored postures whose pad poses are near. The found postures keep the
+    joint limits and the least manipulability; the best few of each box pose are returned.
 
     Args:
         arm: the arm.
@@ -288,7 +296,8 @@ class PoseSearch:
     """
 
     def __init__(self, orientation: Orientation, ways: Sequence[WayToHold], poses: Array) -> None:
-        """Mark the poses at which the box itself meets the scene.
+        """Begin a search at n box poses, and mark those at which the box itself collides with the
+        environment.
 
         Args:
             orientation: convention of the last three numbers of a pose.
@@ -306,8 +315,9 @@ class PoseSearch:
     def attempt(
         self, number: int, libraries: Sequence[PostureLibrary], rows: NDArray[np.intp]
     ) -> None:
-        """Try one way to hold the box at several poses. Poses for which a way has been found are
-        left out.
+        """Try one way to hold the box at several poses, and store the results in this search.
+
+        Poses at which an earlier way holds the box are skipped.
 
         Args:
             number: index of the way.
@@ -331,7 +341,11 @@ class PoseSearch:
         self._pair(number, found, rows)
 
     def _pair(self, number: int, free: Sequence[ReachedPoses], rows: NDArray[np.intp]) -> None:
-        """Find pairs of both arms' postures that do not collide, the most comfortable first.
+        """Find at each box pose a pair of both arms' postures without collision, and store it in
+        this search.
+
+        Pairs are tried in the order of comfort, up to `COMPARED_PAIRS` per pose; the first free one
+        is taken.
 
         Args:
             number: index of the way.
