@@ -323,7 +323,9 @@ def add(parser: argparse._ActionsContainer, *names: str, **own: Any) -> None:
 
 
 def add_wishes(parser: argparse._ActionsContainer) -> None:
-    """Add the options that say what a recommended carry should be best at (`Wish`)."""
+    """Add the options `--duration`, `--force-limit` and `--payload`, which decide which carry is
+    recommended (`Wish`).
+    """
     parser.add_argument(
         "--duration",
         type=force,

@@ -326,8 +326,10 @@ def run_program(main: Callable[[], int]) -> int:
 
 
 def _leave() -> None:
-    """End the process at once if threads are running, because the interpreter would wait for them.
-    Files are replaced in one step, so none is left half written."""
+    """End the process at once, with the exit code of an interruption, if threads are still running:
+    the interpreter would wait for them. No file is left half written, because files are replaced in
+    one step.
+    """
     main = threading.main_thread()
     if any(not each.daemon for each in threading.enumerate() if each is not main):
         sys.stderr.flush()

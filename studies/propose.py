@@ -19,8 +19,8 @@ from symbolic.errors import SettingsError
 
 
 def _ranges(text: str) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Parse two ranges [m] from 'LOW:HIGH,LOW:HIGH'. If the text has one range, the second one is
-    (0, 0).
+    """Parse the ranges [m] within which the pads may be moved, upwards and along their faces, from
+    'LOW:HIGH,LOW:HIGH'. The second range is (0, 0) if the text has only one.
 
     Raises:
         argparse.ArgumentTypeError: there are more than two ranges, or a range is reversed.

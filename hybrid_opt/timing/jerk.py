@@ -185,6 +185,8 @@ def time_with_jerk(
 ) -> JerkTiming:
     """Compute a fast timing from rest to rest within all limits, with continuous accelerations.
 
+    If the path has no timing without jerk limits either, the result states why.
+
     Args:
         model: timing model of the workcell.
         x: (n_var,) decision vector.
@@ -193,7 +195,8 @@ def time_with_jerk(
         fastest: the timing without jerk limits; computed if None.
 
     Raises:
-        SettingsError: x does not fit the workcell, or limited robust forces have no derivatives.
+        SettingsError: x does not fit the workcell; or `limits` bound robust forces, and the contact
+            model has no derivatives of these (`applicable_jerk_limits`).
     """
     motion = model.path_motion(x)
     fastest = fastest or time_path(model, x, limits, motion)
@@ -557,15 +560,16 @@ class WarpedPath:
 
 
 def _add_linearised(at: WarpedPath, c: Array, value: Array, by: Array, rows: JerkProgram) -> None:
-    """Add rows value + by (c_new - c) <= 1 for limited values, linearised at spline coefficients c.
+    """Add the rows value + by (c_new - c) <= bound for limited values, linearised at spline
+    coefficients c. The bound is 1, less where limits are tightened.
 
-    A value that exceeds one at c gets a row that allows the same excess.
+    A value that exceeds its bound at c gets the value itself as bound, so that c stays feasible.
 
     Args:
         at: samples of the path.
         c: (k,) spline coefficients of the squared speed.
-        value: (n, m) values at c over their limits.
-        by: (n, m, k) derivatives of the values by the coefficients.
+        value: (n, m) ratios of the values at c to their limits.
+        by: (n, m, k) derivatives of the ratios by the coefficients.
         rows: convex program that gets the rows.
     """
     bound = np.maximum(at.keep[:, None], value) - value + by @ c

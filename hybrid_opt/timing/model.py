@@ -591,8 +591,8 @@ class SpeedProfile:
 
 
 def sample_limits_set(compiled: CompiledCell, lanes: int) -> NumericFunction:
-    """Load or build the compiled function `symbolic.limit_coefficients.sample_limits_function` of a
-    cell.
+    """Load or build the compiled function of the coefficients of all timing limits at one sample,
+    `symbolic.limit_coefficients.sample_limits_function`.
 
     Args:
         compiled: the cell with its compiled functions.

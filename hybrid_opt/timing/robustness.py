@@ -195,10 +195,11 @@ def robustness_margins(model: TimingModel, carry: Carry) -> tuple[Margin, ...]:
 
 
 def _even_margins(model: TimingModel, carry: Carry) -> list[Margin]:
-    """Compute for each elastic pad the largest shift of its centre of pressure without lift-off of
-    the pad's rim, and how much of it the carry leaves unused [m].
+    """Compute the margin of each elastic pad against lift-off of its rim [m]: the shift of the
+    centre of pressure at which the rim lifts off, and the part of this shift that the carry leaves
+    unused.
 
-    Contact models without elastic pads give an empty list.
+    The list is empty for contact models without elastic pads.
 
     Args:
         model: timing model of the workcell.

@@ -158,7 +158,8 @@ def _averaged(grid_speed: Array, width: float) -> tuple[Array, Array, Array]:
         width: half the width of the window [s].
 
     Returns:
-        u, u' [1/s] and u'' [1/s^2] at times that are `STEPS_PER_SAMPLE` steps of the average apart.
+        Samples of u, u' [1/s] and u'' [1/s^2], uniform in time, `STEPS_PER_SAMPLE` times
+        `AVERAGING_STEP` apart.
     """
     intervals = len(grid_speed) - 1
     grid = np.linspace(0.0, 1.0, intervals + 1)

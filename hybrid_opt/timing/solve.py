@@ -184,7 +184,8 @@ def _slow_down(
 
 
 def path_error(model: TimingModel, motion: PathMotion) -> Timing | None:
-    """Return the error of a path on which nothing moves or an arm fails, else None.
+    """Return the error of a path that has no timing at any speed, else None. On such a path nothing
+    moves, or an arm does not reach a pose, leaves its joint range or is near a singularity.
 
     Args:
         model: timing model of the workcell.

@@ -375,7 +375,8 @@ def draw(
     explained: Mapping[str, Explanation],
     output: Path,
 ) -> tuple[str, ...]:
-    """Draw the paper's Figures 4 and 5 and, for each carry that fails, its first collision.
+    """Draw the regions that the pads reach and the cell at the start (the paper's Figures 4 and 5)
+    and, for each carry that fails by a collision, the colliding bodies.
 
     Args:
         cell: the cell.

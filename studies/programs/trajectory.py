@@ -120,7 +120,7 @@ def _driven(cell: Cell, x: Array) -> ProgramResult:
         x: (n_var,) decision vector of the carry.
 
     Returns:
-        Duration of carry and job [s] and commanded force [N]; or the reason why no job can be
+        Durations of carry and job [s] and commanded force [N]; or the reason why no job can be
         planned.
     """
     try:
@@ -208,12 +208,13 @@ def _chosen(
 
 
 def _report(job: Job, stiffness: float | None) -> str:
-    """Return a text on a job: its phases, the effects of position control and of one arm's delay,
-    and warnings.
+    """Return a text on a job: its phases, the contact forces if both arms are position-controlled,
+    the contact forces if one arm lags behind the other, and warnings.
 
     Args:
         job: the job.
-        stiffness: stiffness of each arm at its pad along the normal [N/m]; None if unknown.
+        stiffness: stiffness of each arm at its pad along the normal [N/m], for the lag; None to
+            leave the lag out.
     """
     parts = [repr(job)]
     if job.follower is not None:

@@ -224,7 +224,7 @@ class ReportData(Experiment):
 
     @property
     def drawn(self) -> tuple[DrawnCarry, ...]:
-        """The trajectories of `carries`, and the recommended carry as robots drive it."""
+        """The trajectories of `carries`, and the recommended carry with the timing of its job."""
         recommended = self.recommended_carry
         return self.carries if recommended is None else (*self.carries, recommended)
 
@@ -234,16 +234,19 @@ class ReportData(Experiment):
 
     @property
     def recommended_carry(self) -> DrawnCarry | None:
-        """The recommended carry as robots drive it; None if they cannot or there is none."""
+        """The recommended carry with the timing of its job; None if there is no recommendation, or
+        no such timing.
+        """
         job = self.job(RECOMMENDED_LABEL)
         carry = None if job is None or job.timing is None else job.timing.carry
         return None if carry is None else DrawnCarry(RECOMMENDED_LABEL, carry, RECOMMENDED_STYLE)
 
     @property
     def recommended_objectives(self) -> Array | None:
-        """(2,) first two objectives of the recommended carry as robots drive it. None without a
-        recommendation, or if the objectives are neither both robots' forces nor duration and
-        force."""
+        """(2,) first two objectives of the recommended carry with the timing of its job. None
+        without a recommendation, or if the objectives are neither both robots' forces nor duration
+        and force.
+        """
         found, reference = self.summary.recommendation, self.workcell.task.reference_force
         if found is not None and self.objectives[:2] == PAPER_OBJECTIVES:
             return np.asarray(found.peak_force / reference)

@@ -377,7 +377,8 @@ class CutCell:
     def of(
         cls, geometry: CellGeometry, solids: Sequence[Solid], marked: Collection[str] = ()
     ) -> CutCell:
-        """Cut solids of a cell into small triangles. The colour of a solid depends on its group.
+        """Cut solids of a cell into small triangles, which can be drawn in the order of their
+        depth. The colour of a solid depends on its group.
 
         Args:
             geometry: geometry of the cell.
@@ -447,8 +448,8 @@ def draw_cell(
         cell: the cell, cut into triangles.
         view: direction from which the cell is seen.
         pose: (6,) pose of the box [m, rad].
-        q: (joints,) joint positions of both arms side by side [rad or m].
-        hidden: kinds of frames whose solids are left out.
+        q: (joints,) joint positions of both arms, the first arm first [rad or m].
+        hidden: values of `frame.kind`, such as 'world', whose solids are left out.
     """
     placed = frame_placements(cell.geometry, pose[None], q[None])
     corners, colours = [], []

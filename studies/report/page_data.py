@@ -382,10 +382,11 @@ def _trajectory(cells: Cells, shown: PageTrajectory) -> dict[str, Any]:
 
 
 def _drive_groups(data: ReportData, drivable: Experiment, cell: int) -> Iterator[MeshGroup]:
-    """Yield the groups of trajectories of the drivable experiment.
+    """Yield the groups of trajectories of the drivable experiment, which the page times as a job
+    does.
 
-    These are the recommended carry, the hand-made path at some force limits, and the final fronts,
-    all timed as robots drive them.
+    These are the recommended carry, the hand-made path at some force limits, and the fronts that no
+    polished front replaces.
 
     Args:
         data: what the report shows.
@@ -473,7 +474,7 @@ def _drive_view(
     groups: Sequence[Numbered],
     found: Sequence[dict[str, Any]],
 ) -> Plot:
-    """Return the plotly plot of duration against commanded force of carries as robots drive them.
+    """Return the plotly plot of duration against commanded force, with the timings of jobs.
 
     The plot shows the hand-made path, the fronts, the recommended carry and the allowed force.
 

@@ -38,9 +38,10 @@ QUARTILES = (25.0, 75.0)
 
 
 def fronts(data: ReportData) -> Figure:
-    """Draw the feasible candidates and non-dominated ones of each algorithm's run with the largest
-    hypervolume (paper Figure 7). The cross is the level payload at rest, the star the planned
-    forces, or time and force, of the recommended carry as robots drive it."""
+    """Draw the feasible and the non-dominated candidates of each algorithm, from its run with the
+    largest hypervolume (paper Figure 7). A cross marks the level payload at rest, a star the
+    recommended carry with the timing of its job.
+    """
     figure = new_figure(0.5)
     panels = figure.subplots(1, 2)
     found = [a.shown.front.objectives for a in data.solved]
@@ -98,8 +99,8 @@ def attainment(data: ReportData) -> Figure:
 
 
 def _attained(title: str, percentile: float) -> str:
-    """Return the legend entry of an attainment surface. Both quartiles look alike, so only one of
-    them gets an entry.
+    """Return the legend entry of an attainment surface. The surfaces of both quartiles share one
+    entry; the second one gets '_', which Matplotlib leaves out.
 
     Args:
         title: name of the algorithm.
@@ -197,9 +198,10 @@ def _zoom(axes: Axes, data: ReportData, sets: Sequence[Array]) -> None:
 
 
 def duration_against_force(data: ReportData, choice: StoredRecommendation) -> Figure:
-    """Draw the shortest drivable durations with at most a commanded force, held in every case of
-    the uncertainty: one curve for each single path, and one for all paths that the recommended
-    carry was chosen from. Limits on jerk hold only for the star."""
+    """Draw the shortest duration of a drivable carry against its largest commanded force, which
+    holds the box in every case of the uncertainty: one curve for each single path, and one for all
+    paths from which the recommended carry was chosen. Only the star is within limits on jerk.
+    """
     figure = new_figure(0.5)
     axes = figure.subplots()
     force, looks = np.array(choice.durations.forces), {RECOMMENDED_LABEL: RECOMMENDED_STYLE}

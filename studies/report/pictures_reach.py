@@ -66,9 +66,11 @@ Classes = tuple[tuple[str, int, int], ...]
 
 
 def holdable_positions(found: HoldMap) -> Figure:
-    """Draw a map of the box positions that both arms can hold: one panel for each height, seen from
-    above, with the number of directions of the box in which they hold it as colour. The best pose
-    is drawn with the box and both arms.
+    """Draw a map of the box positions at which both arms can hold the box.
+
+    There is one panel for each height, seen from above. The colour states for how many directions
+    of the box (angles about the vertical) both arms can hold it. The best pose at each height is
+    drawn with the box and both arms.
 
     Args:
         found: the map.
@@ -113,8 +115,8 @@ def holdable_positions(found: HoldMap) -> Figure:
 
 
 def _classes(yaws: int) -> Classes:
-    """Divide the numbers 1 to `yaws` of directions of the box into at most `MOST_SHADES` classes
-    with one colour each, dark for many directions.
+    """Divide the possible numbers of directions of the box, 1 to `yaws`, into at most `MOST_SHADES`
+    classes with one colour each; dark colours stand for many directions.
     """
     edges = np.unique(np.linspace(0, yaws, min(yaws, MOST_SHADES) + 1).round().astype(int))
     shades = mpl.colormaps["YlGn"](np.linspace(0.3, 0.9, len(edges) - 1) if yaws > 1 else [0.7])

@@ -173,9 +173,10 @@ def _run(
 
 
 def _band(problem: str, evaluations: int, algorithm: str, population: int) -> Band | None:
-    """Return the published reference band for an algorithm on a problem, None if there is none.
+    """Return the published mean and deviation ('band') with which an algorithm's results on a
+    problem are compared, None if there are none.
 
-    Bands exist for Coello's MOPSO and its variant.
+    They exist for Coello's MOPSO and its variant with the population `BAND_POPULATION`.
 
     Args:
         problem: name of the test problem.

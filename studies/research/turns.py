@@ -122,10 +122,11 @@ DUAL_ARM_EXPORT double dual_arm_peak(long long rounds) {
 
 
 def peak_operations() -> float | None:
-    """Measure how many additions and multiplications one core makes per second in lanes.
+    """Measure how many floating-point additions and multiplications one core can make per second
+    with vector instructions.
 
     The result is the best of several runs of a loop with sixteen independent sequences of
-    operations; None on a machine without lanes.
+    operations; None on a machine without vector instructions.
     """
     library = load_or_build_program("peak", "peak", dict, _LOOP)
     if library.dual_arm_lanes() < 2:

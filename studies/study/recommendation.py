@@ -439,7 +439,8 @@ def least_force(campaign: CampaignResults, task: Task) -> dict[str, Array]:
 
 
 def is_drivable(workcell: Workcell, objectives: Sequence[str]) -> bool:
-    """Return True if the carries of an experiment are timed as robots drive them.
+    """Return True if an experiment searches for drivable carries: the cell has the drivable time
+    law, and the objectives are duration and force.
 
     Args:
         workcell: cell of the experiment.

@@ -399,10 +399,10 @@ def robot_wrenches(workcell: Workcell) -> Array:
     """Return a matrix (6, 6 k) that maps the wrenches of k pads to force [N] and moment [N m] along
     the axes of contact 1.
 
-    Six columns belong to each pad. They take its moment about the nominal contact point of the
-    pad's own robot, so that the columns of one robot's pads together give this robot's wrench. A
-    pad's wrench holds, along the pad's axes, normal force, tangential force (2,), the normal force
-    times the shift (2,) of the centre of pressure, and torsion.
+    Each pad has six columns. The moment is taken about the nominal contact point of the pad's
+    robot, so that the sum over a robot's pads is the wrench of this robot. A pad's wrench holds,
+    along the pad's axes, normal force, tangential force (2,), the normal force times the shift (2,)
+    of the centre of pressure, and torsion.
     """
     axes, columns = workcell.contacts[0].T_box_pad[:3, :3], []
     for pad, robot in zip(workcell.pads, workcell.pad_robots, strict=True):

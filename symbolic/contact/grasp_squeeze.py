@@ -220,12 +220,13 @@ def commanded_slack(
 
 
 def internal_force_gain(squeeze: GraspSqueeze) -> ca.Function:
-    """Build the function of the additional commanded force per newton with which the arms push
-    against each other.
+    """Build the function of the additional commanded force that is needed per newton of an internal
+    force with which the arms push against each other.
 
-    The push is a tangential force at any one of the pads. Friction has to bear it, so the pads
-    press harder. Inputs: friction coefficients (2,) and relative patch sizes (2,) of the robots,
-    then the symbolic parameters. Output: the additional commanded force over the push, a scalar.
+    The internal force is a tangential force at any one of the pads. Friction has to bear it, so the
+    pads press harder. Inputs: friction coefficients (2,) and relative patch sizes (2,) of the
+    robots, then the symbolic parameters. Output: the additional commanded force over the internal
+    force, a scalar.
     """
     friction, share = ca.SX.sym("friction", 2), ca.SX.sym("share", 2)
     given = squeeze.squeeze_states(friction, share / squeeze.numbers.reach)

@@ -194,7 +194,8 @@ def measured(
     seed: int,
     study: bool,
 ) -> TaskResult:
-    """Propose a carry for one task, and write the problem file and the workcell file.
+    """Propose a carry for one task, and return its length and the working times. The problem file
+    and the proposed workcell file are written.
 
     Args:
         benchmark: benchmark with the task.

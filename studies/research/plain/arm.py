@@ -24,10 +24,12 @@ from symbolic.robot.arm import (
 
 
 def held_model(robot: Robot) -> tuple[pin.Model, list[int], Array]:
-    """Build Pinocchio's model of a robot's whole description, and find the joints that do not move.
+    """Build Pinocchio's model of a robot's whole description, and find the joints that are held at
+    a fixed position, because the workcell locks them or because they do not move the flange.
 
     Returns:
-        The model, the indices of these joints, and the configuration (nq,) with their positions.
+        The model; the indices of the held joints; and a configuration (nq,) with their positions,
+        in which all other joints are neutral.
     """
     urdf = read_urdf(robot.urdf, robot.xacro_arguments, robot.package_dirs)
     moving = moving_joints(urdf, robot.chain_root, robot.flange, robot.locked_joints)
