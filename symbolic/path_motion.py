@@ -118,7 +118,8 @@ def path_motion_function(model: CellModel, samples: int) -> ca.Function:
 
 
 def start_posture(model: CellModel, arm: int, groups: MXGroups) -> ca.MX:
-    """Return the joint positions (n,) [rad or m] of an arm at the start of the path.
+    """Return the joint positions (n,) [rad or m] in which an arm holds the box at the start of the
+    path: its start branch, as an expression.
 
     Args:
         model: the cell.

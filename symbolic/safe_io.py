@@ -95,8 +95,11 @@ def read_bytes(
 
 
 def require(path: Path, most: int) -> None:
-    """Check that `read_bytes` would accept the file at `path`, of at most `most` bytes; nothing is
-    read.
+    """Check that `read_bytes` would accept a file, without reading it.
+
+    Args:
+        path: the file, or a symbolic link to it.
+        most: largest accepted size [bytes].
 
     Raises:
         OutsideError: the file cannot be read, is not a regular file, or is larger than `most`.
@@ -354,11 +357,12 @@ def sync_folder(folder: Path) -> None:
 
 @contextmanager
 def _alone(draft: Path, mode: int) -> Iterator[BinaryIO]:
-    """Open a new, empty file, with an exclusive lock if the file system supports locks.
+    """Open a file for writing, emptied, while no other process writes it: under an exclusive lock,
+    if the file system supports locks.
 
     Args:
         draft: path of the file.
-        mode: permission bits of the file.
+        mode: permission bits of a new file.
     """
     while True:
         with open(os.open(draft, os.O_WRONLY | os.O_CREAT | os.O_NOFOLLOW, mode), "wb") as file:
@@ -371,10 +375,8 @@ def _alone(draft: Path, mode: int) -> Iterator[BinaryIO]:
 
 
 def _is_still(draft: Path, file: BinaryIO) -> bool:
-    """Return True if the path `draft` still refers to the open file.
-
-    It does not if a former owner of the lock has renamed the file.
-    """
+    """Return True if the path `draft` still refers to the open file. It does not if a former owner
+    of the lock has renamed the file."""
     try:
         return os.path.samestat(os.fstat(file.fileno()), draft.stat(follow_symlinks=False))
     except FileNotFoundError:

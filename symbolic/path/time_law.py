@@ -206,11 +206,11 @@ def _ramped(
 
 
 def _length_rate_function(task: Task) -> ca.Function:
-    """Build the function of the arc length per unit of u [m] and its derivative by u.
+    """Build the function of the arc length per unit of u [m] and of its derivative by u.
 
     Inputs: pose (6,) of the box [m, rad], its first and second derivative by u (6,), then the
-    task's symbolic parameters. The arc length is the longer of translation and rotation. A rotation
-    counts as its angle times reference speed over reference angular speed.
+    task's symbolic parameters. The arc length grows by translation or by rotation, whichever is
+    more. A rotation counts as its angle times reference speed over reference angular speed.
     """
     pose, first, second = (ca.SX.sym(name, 6) for name in ("pose", "first", "second"))
     lever = task.reference_speed / task.reference_angular_speed
@@ -226,7 +226,8 @@ def _length_rate_function(task: Task) -> ca.Function:
 
 
 def _ramp_function(task: Task) -> ca.Function:
-    """Build the function of a smooth motion from rest to rest.
+    """Build the function of the motion along an arc from rest to rest by the time law `ramped`:
+    smooth ramps at both ends, and constant speed between them.
 
     Inputs: arc length so far [m], total arc length [m], then the task's symbolic parameters.
     Outputs at this arc length: time [s], speed [m/s] and acceleration [m/s^2].

@@ -65,10 +65,12 @@ def chain_joints(urdf: Urdf, root: str, tip: str) -> tuple[str, ...]:
 
 
 def held_joints(urdf: Urdf, moving: Sequence[str], locked: Positions) -> Positions:
-    """Return the joints of a description that do not move, each with its position [rad or m].
+    """Return the joints of a description that are held while the joints `moving` move, each with
+    its position [rad or m].
 
-    The position is the one in `locked`, else zero or the limit closest to zero. The position of a
-    joint that mimics a joint that does not move follows from it.
+    The position is the one in `locked`, else zero or the limit closest to zero. A joint that mimics
+    a held joint follows from the position of that joint. A joint that mimics one of `moving` is
+    held at its offset, with a warning, if it moves no link with a shape or mass.
 
     Args:
         urdf: the description.
@@ -121,8 +123,13 @@ class RobotModelWarning(DualArmWarning):
 
 @cache
 def _warn_left_out(file: str, joint: str, mimicked: str) -> None:
-    """Warn once that a joint of the URDF `file` does not follow the joint `mimicked` that it
-    mimics."""
+    """Warn once that a joint mimics a moving joint but is held in the model.
+
+    Args:
+        file: name of the URDF file.
+        joint: the joint that is held.
+        mimicked: the joint that it mimics.
+    """
     warnings.warn(
         f"{file}: joint {joint!r} does not follow {mimicked!r}, which moves; what hangs on it has "
         "neither shape nor mass",
@@ -421,10 +428,8 @@ class ArmLinks:
 
 
 def one_machine(robots: Arms) -> bool:
-    """Return True if two robots are arms of one machine.
-
-    Their joints are in one description, at one base pose.
-    """
+    """Return True if two robots are arms of one machine: both are chains of the same description,
+    and the base of this description has one pose."""
     first, second = robots
     return (
         bool(first.chain_root and second.chain_root)
@@ -464,7 +469,8 @@ UNMOVED = "universe"
 
 
 def common_joints(robots: Arms) -> tuple[str, ...]:
-    """Return the names of the joints that move both arms of one machine, from the root outwards."""
+    """Return the names of the joints that move both arms of one machine, from the root outwards; ()
+    for separate robots."""
     if not one_machine(robots):
         return ()
     first, second = (tuple(arm_model(robot).names)[1:] for robot in robots)
@@ -472,7 +478,9 @@ def common_joints(robots: Arms) -> tuple[str, ...]:
 
 
 def machine_problem(robots: Arms) -> str:
-    """Return why two robots cannot be the arms of one machine; '' if they can."""
+    """Return why two robots that are one machine cannot be its arms: because they do not move
+    independently, or hold a joint at different positions. Return '' if they can, and for separate
+    robots."""
     if not one_machine(robots):
         return ""
     chains, held = [], []
@@ -525,8 +533,8 @@ def _carriers(robot: Robot) -> dict[str, str]:
 
 
 def _mount(robot: Robot, still: Collection[str]) -> str:
-    """Return the name of the link on which an arm is mounted: the last link before the flange that
-    the arm's own joints do not move and that has shapes; '' if there is none.
+    """Return the name of the link on which an arm is mounted: the last link on the way to its
+    flange that has shapes and that the arm's own joints do not move. Return '' if there is none.
 
     Args:
         robot: the arm.
@@ -541,12 +549,13 @@ def _mount(robot: Robot, still: Collection[str]) -> str:
 
 
 def body_names(workcell: Workcell) -> dict[str, tuple[str, ...]]:
-    """Return the names of all bodies, by which a workcell file excludes pairs from checks.
+    """Return the names of all collision bodies, which a workcell file uses to exclude pairs from
+    checks.
 
-    The keys of the result are the bodies' owners: `payload`, `environment` and the names of both
-    robots. The payload is called `payload`; a body of the environment has its own name; a link or
-    tool body of a robot is `ROBOT/NAME`. Fixed links of a machine with both arms have the name of
-    the first robot.
+    Returns:
+        Names of the bodies by owner: under `payload` the name `payload`, under `environment` the
+        bodies' own names, and under each robot's name its links and tool bodies as `ROBOT/NAME`.
+        Links that a machine with two arms has once are listed with the first robot.
     """
     names = {
         PAYLOAD_NAME: (PAYLOAD_NAME,),

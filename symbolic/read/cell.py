@@ -214,7 +214,8 @@ def _digest(content: bytes, workcell: Workcell) -> str:
 
 
 def _named(workcell: Workcell) -> Iterator[bytes]:
-    """Yield the content of every file that a workcell names, empty for a missing file."""
+    """Yield the content of every file that a workcell names, empty for a mesh that is not found.
+    The order is the one that `_digest` states."""
     for robot in workcell.robots:
         yield description_content(robot.urdf, robot.xacro_arguments, robot.package_dirs)
         urdf = robot_urdf(robot)
@@ -342,13 +343,12 @@ def _owners(table: Any, path: str) -> Iterator[tuple[dict[str, Any], str]]:
 
 
 def _among(tables: list[dict[str, Any]], rest: str) -> Iterator[tuple[dict[str, Any], str]]:
-    """Yield the results of `_owners` for an array of tables: tables that contain the last key of
-    the path.
+    """Yield the results of `_owners` for one or all tables of an array.
 
     Args:
         tables: the tables of the array.
-        rest: rest of the key path. If it begins with an index or a table's name, one table is
-            selected; otherwise all.
+        rest: rest of the key path. If it begins with an index or a table's name, this table is
+            selected; otherwise all tables are.
     """
     if found := _INDEX.match(rest):
         k = int(found[1])

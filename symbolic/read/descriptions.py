@@ -119,7 +119,8 @@ def _package_name(folder: Path) -> str | None:
 def further_package_dirs(
     addresses: Iterable[str], package_dirs: Sequence[Path], description: Path
 ) -> tuple[Path, ...]:
-    """Return the folders, outside `package_dirs`, of packages that mesh addresses name.
+    """Return the folders that contain the packages of mesh addresses, as far as these folders are
+    not in `package_dirs`.
 
     Each folder is listed once. Packages that are not found are left out.
 
@@ -264,10 +265,9 @@ _NOMINAL = re.compile(r"default_kinematics\.ya?ml$", re.IGNORECASE)
 
 
 def nominal_kinematics(content: bytes, arguments: Arguments) -> str:
-    """Return the name of the xacro argument with which an arm's measured kinematics should be
-    stated; '' if they are stated, or if the file has no such argument.
-
-    They are not stated if the argument has no value, or if its value is the maker's nominal file.
+    """Return the name of the xacro argument that should state the measured kinematics of an arm but
+    does not: it is not given, or its value is the maker's nominal file. Return '' if it is given or
+    the file has no such argument.
 
     Args:
         content: content of the xacro file.
@@ -316,6 +316,9 @@ def _answer(request: Any) -> Any:
 
     Request and answer are JSON values. The answer is None if the process exceeds its limit of time
     or memory.
+
+    Raises:
+        OutsideError: the process ended without an answer.
     """
     paths = [os.path.abspath(entry) for entry in sys.path]
     with tempfile.TemporaryFile() as answer:
@@ -373,9 +376,9 @@ _WRITING = os.O_WRONLY | os.O_RDWR | os.O_CREAT | os.O_TRUNC
 
 def main() -> int:
     """Expand the xacro file that a JSON request on standard input names, and write the answer as
-    JSON to standard output.
+    JSON to standard output: the URDF and the included files, or the reason of a refusal.
 
-    This function runs in a process of its own. It returns the exit code.
+    This function runs in a process of its own. It returns the exit code 0.
     """
     request = json.load(sys.stdin)
     path = Path(request["path"])
@@ -504,12 +507,12 @@ def _by_package(address: str, packages: Mapping[str, Path]) -> str:
 
 
 def _refusal(error: BaseException, xacro: Any) -> OutsideError:
-    """Convert an error of an expansion to an `OutsideError` whose message names the file and the
-    macro.
+    """Convert an error during an expansion to an `OutsideError`. The message names the file and the
+    macro in which the error arose.
 
     Args:
         error: the error.
-        xacro: the module `xacro`; its stacks of files and macros show where the error arose.
+        xacro: the module `xacro`, whose stacks hold the open files and macros.
     """
     causes = [error]
     for one in causes:  # an error and those that it was made of

@@ -195,7 +195,7 @@ class ElementReader:
         return value
 
     def number(self, key: str, allowed: Range, default: str | None = None) -> float:
-        """Read an attribute as a finite number.
+        """Read an attribute as a finite number; 1 after a problem.
 
         Args:
             key: name of the attribute.
@@ -213,20 +213,20 @@ class ElementReader:
             default: text for a missing attribute; None if the attribute is required.
 
         Returns:
-            Array (n,).
+            Array (n,), ones after a problem.
         """
         if key in self.element.attrib:
             self.kept.set(key, self.element.attrib[key])
         return self._numbers(self.at(key), self.element.get(key, default), allowed)
 
     def content(self, allowed: Sequence[Range]) -> Array:
-        """Read the numbers between the element's tags, separated by spaces.
+        """Read the n numbers between the element's tags, separated by spaces.
 
         Args:
-            allowed: ranges of the n numbers.
+            allowed: ranges of the numbers.
 
         Returns:
-            Array (n,).
+            Array (n,), ones after a problem.
         """
         return self._numbers(self.path, self.element.text, allowed)
 

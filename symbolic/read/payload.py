@@ -143,7 +143,8 @@ ALONG_Z = 0.9  # share of a normal along z from which on a pad's x axis is measu
 
 
 def read_contact(table: TableReader, payload: Payload) -> Contact:
-    """Read the pads of one robot.
+    """Read the contact of one robot: its first pad or hand, with further ones of the same kind in
+    the field `further`.
 
     Args:
         table: the robot's entry of `contacts` in the workcell file.

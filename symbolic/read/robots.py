@@ -322,12 +322,12 @@ def _argument(value: str, folder: Path) -> str:
 
 @contextmanager
 def _recorded(table: TableReader, key: str) -> Iterator[None]:
-    """Convert errors that are raised in the `with` block to problems of the value at a key of a
-    table.
+    """Record errors that are raised in the `with` block as problems of one value in a table,
+    instead of raising them.
 
     Args:
         table: the table.
-        key: the key.
+        key: key of the value.
     """
     try:
         yield
@@ -339,8 +339,8 @@ def _recorded(table: TableReader, key: str) -> Iterator[None]:
 
 
 def _read_named(table: TableReader) -> NamedRobot:
-    """Return the files of the robot description that the key 'robot' names. Problems are recorded
-    at the key 'urdf'."""
+    """Return the files of the robot description that the key 'robot' names. A problem is recorded
+    at the key 'urdf', and the result is then empty."""
     name = table.text("robot")
     if table.has("urdf"):
         table.add("urdf", "found beside 'robot'; give one of the two")
@@ -378,12 +378,12 @@ def _read_folders(table: TableReader, folder: Path) -> tuple[Path, ...]:
 def _read_described(
     table: TableReader, key: str, folder: Path, package_dirs: tuple[Path, ...]
 ) -> Path:
-    """Read the path of a robot's file, which the value of a key states as a relative path or as an
-    address package://NAME/...
+    """Read the path of a robot's file; after a problem return `folder`. The file states a relative
+    path or an address package://NAME/...
 
     Args:
         table: the arm's section of the workcell file.
-        key: the key.
+        key: key of the path.
         folder: folder to which a path is relative.
         package_dirs: folders of packages for an address.
     """
@@ -403,9 +403,10 @@ def _read_described(
 
 
 def _read_chain(table: TableReader) -> tuple[str, str]:
-    """Read the names of the links at which the arm begins and ends: the key 'chain' or 'flange'.
+    """Read the names of the links at which the arm begins and ends, from the key 'chain' or
+    'flange'.
 
-    The first name is '' if the file states the flange only.
+    The first name is '' if the file states the flange only. Both are '' after a problem.
     """
     if not table.has("chain"):
         return "", table.text("flange")
@@ -421,13 +422,16 @@ def _read_chain(table: TableReader) -> tuple[str, str]:
 def _read_model(
     table: TableReader, urdf: Urdf, locked: Positions, root: str, flange: str
 ) -> pin.Model | None:
-    """Return the arm's model; None if a problem is recorded.
+    """Build the arm's model, and record problems of the description, the chain and the flange.
 
     Args:
         table: the robot's section.
         urdf: the robot's description.
         locked: joints that the user holds, with their positions [rad or m].
         root, flange: links at which the arm begins and ends; root '' for the whole description.
+
+    Returns:
+        The model; None if it cannot be built or is not a serial arm.
     """
     moving: tuple[str, ...] | None = None
     model: pin.Model | None = None

@@ -101,8 +101,8 @@ class TableReader:
         return default
 
     def has(self, key: str) -> bool:
-        """Return True if an optional key is present; `close` then does not report the key as
-        unknown."""
+        """Return True if an optional key is present. The key then counts as read, so that `close`
+        does not report it as unknown."""
         return self.raw(key, None) is not None
 
     def refuse(self, key: str, others: Sequence[str]) -> None:
@@ -500,8 +500,8 @@ SHAPES = {"box": Box, "cylinder": Cylinder, "sphere": Sphere, "mesh": Mesh}
 
 
 def read_pose(table: TableReader, key: str) -> Array:
-    """Read a pose (4, 4), read-only, from the sub-table at `key` with xyz [m] and rpy [rad], zero
-    by default."""
+    """Read a pose (4, 4), read-only, from the sub-table at `key`. Its keys xyz [m] and rpy [rad]
+    are zero by default."""
     inner = table.table(key)
     pose = _xyz_rpy(inner)
     inner.close()

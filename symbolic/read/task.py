@@ -135,10 +135,12 @@ def _check_vectors(task: Task, problems: Problems) -> None:
 
 
 def with_force_limit(workcell: Workcell) -> Workcell:
-    """Return the workcell with the range in which searches choose the force limit.
+    """Return the workcell with the range of the force limit, a decision variable of drivable
+    carries.
 
     The workcell file may state the range. Otherwise it begins at 1.001 times the force that holds
-    the payload level and at rest, and ends at the smaller of both robots' reference forces.
+    the payload level and at rest, and ends at the smaller of both robots' reference forces; if this
+    is less than its beginning, the range is one value.
     """
     task = workcell.task
     if np.isfinite(task.force_limit[1]):
@@ -181,7 +183,12 @@ def _fixed(table: TableReader, key: str) -> Waypoint:
 
 def _waypoints(table: TableReader, names: Sequence[str]) -> list[Waypoint]:
     """Read one table of `task.waypoints`: a fixed waypoint, or `count` free waypoints with equal
-    bounds. `names` are the names of a pose's six numbers, for messages."""
+    bounds.
+
+    Args:
+        table: the table.
+        names: names of a pose's six numbers, for messages.
+    """
     if table.has("fixed"):
         pose = table.vector("fixed", quantity.POSE)
         table.refuse("fixed", ("lower", "upper", "count"))
@@ -206,9 +213,14 @@ def _waypoints(table: TableReader, names: Sequence[str]) -> list[Waypoint]:
 
 
 def _read_initial(table: TableReader, free: list[Waypoint], names: Sequence[str]) -> Array:
-    """Read `initial` of the task's table: initial poses (n_free, 6) of the waypoints `free` [m,
-    rad], by default the middle of their bounds. `names` are those of a pose's numbers, for
-    messages."""
+    """Read the initial poses (n_free, 6) of the free waypoints [m, rad], from the key `initial`.
+    The default is the middle of their bounds.
+
+    Args:
+        table: the task's section of the workcell file.
+        free: the free waypoints.
+        names: names of a pose's six numbers, for messages.
+    """
     value = table.raw("initial", None)
     path, problems = table.at("initial"), table.problems
     if value is None:
@@ -380,9 +392,10 @@ def _choice(
 
 
 def _entry(entries: Sequence[RedundancyEntry], robot: Robot, name: str) -> RedundancyEntry:
-    """Return the table of `task.redundant` for a robot's joint; an empty one if the file has none.
+    """Return the entry of `task.redundant` for a robot's joint; an entry without values if the file
+    has none.
 
-    The name 'robot/joint' takes precedence over the name of the joint alone.
+    An entry for 'robot/joint' takes precedence over one for the name of the joint alone.
     """
     by_name = {entry.joint: entry for entry in reversed(entries)}
     nothing = RedundancyEntry("", name)

@@ -233,7 +233,7 @@ class Contact:
 
     @property
     def area(self) -> float:
-        """Area of the contact patch, or within the rim of a cup [m^2]."""
+        """Area of the contact patch [m^2]; of a cup the area within its lip."""
         if self.half_sides is None:
             return float(np.pi * self.patch_radius**2)
         return float(4.0 * np.prod(self.half_sides))
@@ -282,15 +282,17 @@ class Uncertainty:
 
     @property
     def title(self) -> str:
-        """Name of the uncertainty in messages, which says whether the cell states it or it is the
-        usual one."""
+        """Name of the uncertainty in messages. It tells an uncertainty that the workcell file
+        states from the usual one."""
         return "the cell's [uncertainty]" if self.stated else "the usual uncertainty"
 
     @property
     def opposed_force(self) -> float:
-        """Largest tangential force with which the arms push against each other [N]:
-        `internal_force`, plus the force of `relative_position` on both arms as springs in
-        series."""
+        """Largest tangential force with which the arms push against each other [N].
+
+        It is `internal_force`, plus the force that `relative_position` causes if `stiffness` is
+        known. Both arms then count as springs in series.
+        """
         return self.internal_force + self.stiffness * self.relative_position / 2.0
 
     @property

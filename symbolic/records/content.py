@@ -57,9 +57,8 @@ def _counted(part: bytes) -> bytes:
 
 @cache
 def _kind(of: type) -> str:
-    """Return the name of the rule by which `digest_of_parts` divides values of a type into parts.
-
-    The result is cached because it is needed often.
+    """Return how `digest_of_parts` divides values of a type into parts: 'plain', 'tuple', 'array',
+    'type', 'content', 'record', 'path' or 'value'. The result is cached because it is needed often.
     """
     if of in (str, int, bool, type(None)):
         return "plain"
@@ -94,8 +93,7 @@ def _array_head(dtype: np.dtype[Any], shape: tuple[int, ...]) -> bytes:
 
 @cache
 def _record(kind: Hashable) -> tuple[bytes, tuple[str, ...]]:
-    """Return the constants of a record class from which the content of each of its records is
-    formed.
+    """Return what the contents of all records of a class have in common.
 
     Returns:
         The bytes with which the content begins: the class name with its length in front; and the

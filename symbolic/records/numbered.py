@@ -107,7 +107,8 @@ class NumberedJoint(RedundantJoint):
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """(n_waypoints,) booleans, True where the joint position is a decision variable."""
+        """(n_waypoints,) True where the joint position is a decision variable, False where it is
+        fixed."""
         return np.array(self.free, dtype=np.bool_)
 
 

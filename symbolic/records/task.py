@@ -71,7 +71,8 @@ class RedundantJoint:
 
     @property
     def moving(self) -> NDArray[np.bool_]:
-        """(n_waypoints,) booleans, True where the joint position is a decision variable."""
+        """(n_waypoints,) True where the joint position is a decision variable, False where it is
+        fixed."""
         return np.asarray(self.lower < self.upper)
 
 

@@ -89,7 +89,8 @@ def flange_target(
 
 
 def limit_margin(robot: Robot, q: ca.SX) -> ca.SX:
-    """Compute the least distance of any joint to its limits [rad], negative beyond a limit.
+    """Compute the least distance of any joint to its limits [rad, or m for a sliding joint],
+    negative beyond a limit.
 
     Args:
         robot: the arm.
@@ -194,17 +195,18 @@ def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str,
     joints, pose residual [m, rad] and flange Jacobian (6, n).
 
     - target: extended pose -> target.
-    - approach: state, pose, target -> joints after `CHEAP_STEPS`, residual before the last step.
-    - closer: joints, target -> joints after one more step, if the condition holds.
+    - approach: state, pose, target -> joints after `CHEAP_STEPS` steps from the extrapolated
+      joints, residual before the last step.
+    - closer: joints, target -> joints after one more such step.
     - place: joints, target -> placement.
     - again: state, pose, target, placement -> the better one of this placement and of the placement
-      after `IK_NEWTON_STEPS` steps by QR, if the condition holds.
-    - held: previous joints, target, placement -> placement at the previous joints, if the condition
-      holds.
+      after `IK_NEWTON_STEPS` steps by QR from other extrapolated joints.
+    - held: previous joints, target, placement -> placement at the previous joints, for an arm that
+      is lost.
     - measures: joints, Jacobian, R_world_box, wrench -> limit margin, manipulability, joint torque.
 
-    The functions with a condition take it as their first input, and copy their input if it is
-    false.
+    closer, again and held take a condition as their first input. If it is false, they return the
+    joints or the placement among their inputs unchanged.
 
     Args:
         robot, model, contact: the arm, its model, and its contact with the box.

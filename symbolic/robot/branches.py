@@ -71,11 +71,11 @@ class StartBranch:
 
     @property
     def rank(self) -> tuple[float, ...]:
-        """Sort key, smaller is better. It ranks by the number of samples of the hand-made
-        trajectory that the arm can follow, then by clearance, then by margin times manipulability.
+        """Sort key; the branch with the smallest key is best. Branches are ordered by the number of
+        samples of the hand-made trajectory that the arm can follow, then by clearance, then by the
+        product of the distance to the nearest joint limit and manipulability.
 
-        Clearance beyond `ROBUST_CLEARANCE` does not count. The margin is the distance to the
-        nearest joint limit.
+        Clearances above `ROBUST_CLEARANCE` count as equal.
         """
         robust = min(self.clearance, ROBUST_CLEARANCE)
         return (-float(self.kept), -round(robust, 4), -self.limit_margin * self.manipulability)
@@ -121,13 +121,15 @@ class ArmSearch:
 def interpreted_search(
     workcell: Workcell, arm: int, model: RobotModel, clearance: Clearance | None = None
 ) -> ArmSearch:
-    """Build the functions of the search for an arm's start branches with CasADi's interpreter.
+    """Build the functions of the search for an arm's start branches, evaluated by CasADi's
+    interpreter instead of compiled code.
 
     Args:
         workcell: the workcell.
         arm: index of the arm, 0 or 1.
         model: model of the arm.
-        clearance: function of the arm's least clearance bound [m]; None for no bound.
+        clearance: function of the arm's least clearance bound [m]; None if clearance does not
+            count.
     """
     track = follow_function(
         workcell.robots[arm], model, workcell.contacts[arm], workcell.task.samples, "follow"

@@ -145,8 +145,8 @@ def _value(model: CellModel, inputs: list[ca.SX], implicit: ImplicitVariables) -
         model: model of the cell.
         inputs: extended pose (6 + m,), its first and second derivative by u, joint positions of
             both arms, u'' and u'^2, each one expression.
-        implicit: collector of results of Newton's method for the contact forces, for exact
-            derivatives.
+        implicit: stores the results of Newton's method for the contact forces, so that derivatives
+            become exact.
     """
     workcell = model.workcell
     limits, joints = limit_layout(workcell), limit_layout(workcell).joints

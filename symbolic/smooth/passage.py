@@ -41,9 +41,9 @@ DIRECTION_NUMBERS = 12
 
 
 def _directions() -> Array:
-    """Return the coefficients of all separating directions: one row each, (SEPARATING_DIRECTIONS,
-    DIRECTION_NUMBERS), as `direction` takes them, but with the obstacle's vectors along the
-    obstacle's own axes."""
+    """Return the coefficients of all separating directions of two boxes, one row each,
+    (SEPARATING_DIRECTIONS, DIRECTION_NUMBERS). They are laid out as in `direction`, except that
+    axes and edges of the obstacle are along the obstacle's own axes, not the world's."""
     found = []
     for first, axes in ((0, 1), (3, 1), (6, 3)):
         for k in range(3):
@@ -172,9 +172,9 @@ class AxisSwitchGap(PathConstraint):
     moving: ClassVar[bool] = True
 
     def expression(self, point: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Build the expression of a gap [m] at the kink where one separating direction takes over
-        from another: both gaps, extended linearly along the path, have this value where they are
-        equal.
+        """Build the expression of the gap [m] at the kink, where the separating direction changes.
+        The gaps along both directions are extended linearly along the path; the expression is their
+        value where the two lines meet.
 
         Args:
             point: symbols of box pose and joints at a point of the path near the kink.

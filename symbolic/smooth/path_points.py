@@ -95,14 +95,18 @@ class PathPointSymbols:
         return DistanceBounds(self.model.screen, *at, softness)
 
     def obstacle(self, pair: int) -> Array:
-        """Return the parameters (BOX_NUMBERS,) of the obstacle of an active pair `pair` from
-        `separable`; the obstacle is a box."""
+        """Return the numbers (BOX_NUMBERS,) that describe the box-shaped obstacle of a pair, as
+        from `box_numbers`.
+
+        Args:
+            pair: index of the pair among the active pairs, one of `separable`.
+        """
         geometry = self.model.geometry
         return box_numbers(geometry.bodies[geometry.active[pair].second])
 
     def separable(self) -> tuple[int, ...]:
-        """Return the indices of the active pairs of the payload and an obstacle that is a single
-        box."""
+        """Return the indices of the active pairs of the payload and a box-shaped obstacle. For
+        these pairs clearance can be constrained along separating directions."""
         columns = enumerate(self.model.geometry.columns.tolist())
         return tuple(pair for pair, column in columns if self.scene.separable(column))
 

@@ -106,7 +106,12 @@ class SampleBlock:
 
 
 def sample_blocks(task: Task) -> tuple[SampleBlock, ...]:
-    """Divide the samples of a task into blocks. One function serves all samples of a block."""
+    """Divide the samples of a task into blocks whose samples depend in the same way on their
+    neighbours. One function serves all samples of a block.
+
+    With a time law by finite differences, these are the samples inside, the first two and the last
+    two. With any other law, one block contains all samples.
+    """
     n, position = task.samples, sample_basis(task).position
     if not task.law.has_differences:
         return (SampleBlock("path", np.arange(n)[None, :], position[None]),)

@@ -62,7 +62,8 @@ def joint_placements(model: pinocchio.Model) -> casadi.Function:
 
 
 def inverse_dynamics(model: pinocchio.Model) -> casadi.Function:
-    """Build the function from q (nq,), v (nv,) and a (nv,) to joint torques (nv,) [N m].
+    """Build the function from q (nq,), v (nv,) and a (nv,) to joint torques (nv,) [N m], or forces
+    of sliding joints [N].
 
     The recursive Newton-Euler algorithm includes the model's gravity and rotor inertias; there are
     no external forces.

@@ -8,7 +8,8 @@ from pathlib import Path
 
 
 def prefixes() -> list[Path]:
-    """Return the existing folders to search, in order of preference."""
+    """Return the existing folders in which CMake finds the configurations of CasADi, Pinocchio and
+    pybind11, in order of preference."""
     found = [Path(folder) for folder in sysconfig.get_paths().values()]
     for package in ("casadi", "cmeel", "pybind11"):
         spec = importlib.util.find_spec(package)
