@@ -180,6 +180,9 @@ def duration_against_force_limit(
         points: number of force limits.
         on_timing: called after every timing.
 
+    Returns:
+        Durations by force limit; no points if the path has no timing without force limit either.
+
     Raises:
         SettingsError: fewer than two points, or x does not fit the workcell.
     """

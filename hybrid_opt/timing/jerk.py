@@ -116,10 +116,11 @@ def driven_timing(model: TimingModel, x: Array) -> Timing:
 
 
 def driven_limits(model: TimingModel, x: Array) -> TimingLimits:
-    """Return the limits of the timing with which robots drive a carry.
+    """Return the limits, in addition to the workcell's, of the timing that `driven_timing`
+    computes.
 
-    If the time law is drivable, these are the limits of drivable carries with the force limit in
-    `x`; otherwise the timing is limited by the reference speeds.
+    With the drivable time law this is the force limit, the last entry of `x`; otherwise these are
+    the reference speeds.
 
     Args:
         model: timing model of the workcell.

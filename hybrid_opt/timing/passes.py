@@ -105,6 +105,9 @@ class ForwardBackwardPasses:
                 `pose_second` (n, 2 intervals + 1, 6 or more) there.
             limits: limits of all paths, for which `supports` returns True.
             force: (n,) force limit of each path [N]; None for the force limit in `limits`.
+
+        Returns:
+            One record per path; without a timing it has infinite duration and states what failed.
         """
         most = np.inf if limits.force is None else limits.force
         options = np.empty((len(paths["limits"]), 4))
@@ -333,18 +336,26 @@ def forward_backward_passes(
 ) -> NumericFunction:
     """Load or build the compiled function that times one path by a backward and a forward pass.
 
-    Inputs of this function: `samples` (2 intervals + 1, columns of `symbolic.limits.limit_layout`),
-    the coefficients of the limits at both ends and in the middle of every interval; `options` (4,),
-    the largest normal force [N], infinite for none, then 0 or 1 each for limits on torques,
-    pressure shifts and the reference speeds; with supporting lines also `cuts` (2 intervals + 1,
-    cuts, 3), at every sample lines alpha u'' + beta u'^2 <= bound with positive bounds, infinite
-    after the last line.
+    Inputs of this function:
 
-    Outputs: `status`, an index into `PASS_STATUSES`; `interval` of a failure; `duration` [s],
-    infinite if there is no timing; `peak` (2,), largest normal forces [N]; `use` (len(LIMIT_NAMES),
-    3), largest share of each limit, with the path parameter and the joint or contact there;
-    `squared` (intervals + 1,), u'^2 at the grid points [1/s^2]; `sweeps`, iterations of both
-    passes; `slowed`, factor on the speed. If there is no timing, peak and use describe rest.
+    - `samples` (2 intervals + 1, columns of `symbolic.limits.limit_layout`): coefficients of the
+      limits at both ends and in the middle of every interval;
+    - `options` (4,): the largest normal force [N], infinite for none; then 0 or 1 each for limits
+      on torques, pressure shifts and the reference speeds;
+    - with supporting lines also `cuts` (2 intervals + 1, cuts, 3): at every sample lines alpha u''
+      + beta u'^2 <= bound with positive bounds, infinite after the last line.
+
+    Outputs, of which `peak` and `use` describe rest if there is no timing:
+
+    - `status`: an index into `PASS_STATUSES`;
+    - `interval`: index of the interval of a failure;
+    - `duration` [s], infinite if there is no timing;
+    - `peak` (2,): largest normal forces [N];
+    - `use` (len(LIMIT_NAMES), 3): largest ratio of value to limit for each limit, with the path
+      parameter and the index of joint or contact there;
+    - `squared` (intervals + 1,): u'^2 at the grid points [1/s^2];
+    - `sweeps`: iterations of both passes;
+    - `slowed`: uniform factor on the path speed, below one if only this made the limits hold.
 
     Args:
         compiled: the workcell with its compiled functions.

@@ -162,6 +162,9 @@ class PathTimer:
             paths: result of `path_limits`; computed if None.
             path_errors: result of `path_errors`; computed if None.
 
+        Returns:
+            One record per path; without a timing it has infinite duration and states what failed.
+
         Raises:
             SettingsError: x has the wrong shape or is not finite, or a force limit is not positive.
         """

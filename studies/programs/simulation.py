@@ -197,8 +197,10 @@ def simulate_pads(
 ) -> None:
     """Simulate a carry with pads but without arms, and print the results.
 
-    These are the least factor of the planned forces that holds the box, the creep of the box, and
-    random cases of the uncertainty.
+    These are: the least factor on the planned forces with which the box holds; the speed at which
+    it creeps on the elastic layers at slightly larger forces; and how many random cases of the
+    uncertainty hold with the commanded forces of a job. With `--sweep` the factor is also found for
+    a shorter and a longer time step.
 
     Args:
         cell: the cell.
@@ -247,8 +249,9 @@ def simulate_hands(
 ) -> None:
     """Simulate a carry in hands without arms, and print the results.
 
-    These are the least factor of the planned forces that holds the payload, and random cases of the
-    uncertainty.
+    These are: the least factor on the planned forces with which the payload holds; how many random
+    cases of the uncertainty hold with the holding forces of a job; and the least factor on these
+    forces in the case that requires most according to the contact model.
 
     Args:
         cell: the cell.

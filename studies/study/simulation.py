@@ -321,14 +321,15 @@ curve."""
 
 
 def timing_stage(curves: bool = True) -> Stage:
-    """Return the stage of a study that times the selected trajectories as robots drive them and
-    writes a file in `timing/` for each.
+    """Return the stage of a study that computes the timings of the selected trajectories
+    (`time_trajectory`) and writes a file in `timing/` for each.
 
     If the union of all fronts was polished, only the trajectory selected from the union and those
     that a report shows are timed.
 
     Args:
-        curves: True to time trajectories that a report shows at many force limits too.
+        curves: True to compute also the curve of duration against force limit for trajectories that
+            a report shows.
     """
 
     def run(folder: CampaignFolder, progress: Progress) -> None:

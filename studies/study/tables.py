@@ -473,8 +473,8 @@ LabelledTimings = Sequence[tuple[str, TimingDocument]]
 
 
 def timings(timed: LabelledTimings, robots: Sequence[str]) -> Table:
-    """Return the table of durations and forces of trajectories, with the timing of the search and
-    with timings that robots can drive.
+    """Return the table of durations and forces of trajectories under each of the timings of
+    `time_trajectory`.
 
     Args:
         timed: label and timings of each trajectory.
@@ -529,8 +529,10 @@ def _timing_cells(timing: StoredTiming) -> tuple[str, ...]:
 
 
 def margins(timed: LabelledTimings) -> Table:
-    """Return the table of how far single values of the model may be off before a carry fails, with
-    the timing that robots drive.
+    """Return the table of how far single values of the model may be off before a carry fails.
+
+    The margins are those of the timing closest to the reference speeds; for the recommended carry,
+    those of its job's timing.
 
     Args:
         timed: label and timings of each trajectory, of which at least one has margins.
