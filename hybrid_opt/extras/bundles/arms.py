@@ -325,7 +325,12 @@ def _add_robot(root: ElementTree.Element, robot: Robot, prefix: str, moving: set
 
 
 def _hold(joint: ElementTree.Element, position: float) -> None:
-    """Change a URDF joint, in place, to a fixed joint at one of its positions [rad or m]."""
+    """Replace a URDF joint, in place, by a fixed joint at a given position.
+
+    Args:
+        joint: the joint's element.
+        position: position of the joint at which it is fixed [rad or m].
+    """
     origin, axis = joint.find("origin"), joint.find("axis")
     xyz, rpy = (
         _numbers("0 0 0" if origin is None else origin.get(key, "0 0 0")) for key in ("xyz", "rpy")

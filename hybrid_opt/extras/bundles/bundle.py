@@ -81,8 +81,17 @@ class Origin:
 
     @classmethod
     def of_file(cls, path: Path, content: bytes, provenance: Mapping[str, Any]) -> Origin:
-        """Derive the origin of a trajectory file from its place in a results folder, such as
-        RESULTS/selected/ALGORITHM/REPLICA.json, and from its content and provenance."""
+        """Derive the origin of a carry from its trajectory file.
+
+        If the path is RESULTS/selected/ALGORITHM/REPLICA.json, the names of study and algorithm
+        follow from it. Otherwise the study is named after the file, and the algorithm follows from
+        the provenance.
+
+        Args:
+            path: path of the file.
+            content: content of the file, of which the SHA-256 is stored.
+            provenance: provenance in the file.
+        """
         path = path.resolve()
         selected = len(path.parts) > 4 and path.parts[-3] == "selected"
         algorithm = path.parts[-2] if selected else provenance.get("algorithm")
@@ -210,7 +219,12 @@ def manifest(
 
 
 def readme(document: Mapping[str, Any], contents: Contents) -> str:
-    """Return the README of a bundle: its content, how to run it, and what stops the robots."""
+    """Return the README of a bundle: its content, how to run it, and what stops the robots.
+
+    Args:
+        document: the manifest, from `manifest`.
+        contents: the other files of the bundle by path, which are listed.
+    """
     squeeze, machine = document["squeeze"], document["machine"]
     phases = [
         f"| {phase['name'].replace('_', ' ')} | {phase['begin']:.2f} | {phase['duration']:.2f} | "

@@ -203,8 +203,13 @@ def read_trajectory(path: Path, workcell: Workcell) -> JointTrajectory:
 
 
 def _csv_columns(text: str) -> tuple[Columns, tuple[float, float] | None]:
-    """Read the columns of a CSV file with joint positions, and the first and last time [s] at which
-    its column `phase` is 'carry'; None if no row has this phase."""
+    """Read a CSV file with joint positions.
+
+    Returns:
+        - Times and columns of the file.
+        - First and last time [s] of the rows with 'carry' in the column `phase`; None without such
+          rows.
+    """
     rows = list(csv.DictReader(io.StringIO(text)))
     titles = {re.sub(r"\s*\[.*\]$", "", title).strip(): title for title in rows[0]}
     (at,) = (word for word in titles if word.lower() in ("time", "t"))
@@ -293,10 +298,14 @@ def check(
     held: tuple[float, float] | None = None,
     interpolation: Interpolation | None = None,
 ) -> Finding:
-    """Check whether two arms can carry the box along a joint trajectory: pads, limits, collisions
-    and normal forces.
+    """Check whether two arms can carry the box along a joint trajectory.
+
+    The check covers the positions of the pads on the box, limits of joints and payload, collisions,
+    and the normal forces that hold the box.
 
     Args:
+        cell: the cell.
+        trajectory: joint positions of both arms over time.
         held: first and last time at which the pads hold the box [s]. None for the times that the
             file states; if it states none, the longest run of samples at which the pads are near
             their planned positions relative to each other.
@@ -377,11 +386,16 @@ def _load(cell: Cell) -> NumericFunction:
 
 
 def _certificate(cell: Cell, joints: BPoly, time: Array) -> str:
-    """Prove that the motion of both arms and box is free of collisions from the first to the last
-    of the times (n,) [s]. `joints` are polynomials of both arms' joint positions.
+    """Prove that the motion of both arms and box is free of collisions.
+
+    Args:
+        cell: the cell.
+        joints: polynomials in time of both arms' joint positions.
+        time: (n,) times [s]; the proof covers the motion from the first to the last one.
 
     Returns:
-        The first colliding pair and its time as text; '' if the motion is proven free.
+        First pair that collides or cannot be proven free, and its time, as text; '' if the motion
+        is proven free.
     """
     workcell = cell.workcell
 
@@ -417,9 +431,14 @@ def _held(along: Array, across: Array) -> Mask:
 
 
 def _poses(workcell: Workcell, q: Array) -> Array:
-    """Compute the box poses (n, 6) [m, rad] if the first arm's pad keeps its position on the box,
-    from joint positions (n, joints) of both arms side by side. The last three numbers are angles or
-    a rotation vector, as in the cell's task."""
+    """Compute the box poses (n, 6) [m, rad] that follow from the first arm, if its pad stays at its
+    position on the box.
+
+    Args:
+        workcell: the cell, whose task says whether the last three numbers are angles or a rotation
+            vector.
+        q: (n, joints) joint positions of both arms side by side [rad or m].
+    """
     T_pad_box = inverse(workcell.contacts[0].T_box_pad)
     T = pad_places(workcell, 0, joints_of(workcell, q)[0]) @ T_pad_box
     orientation = workcell.task.orientation

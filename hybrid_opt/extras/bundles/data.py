@@ -79,8 +79,11 @@ RECORDED = (
 
 
 def recording(export: Export) -> dict[str, str | bytes]:
-    """Return the files of a ROS 2 recording of a job by path, its time stamps from zero; without
-    the extra `ros`, only a note that says what to install."""
+    """Return the files of a ROS 2 recording of a job by path. Its time stamps begin at zero.
+
+    If the optional packages `ros` of this project are not installed, the result is only a note on
+    how to install them.
+    """
     try:
         from mcap.writer import Writer
         from rosbags.typesys import Stores, get_typestore

@@ -42,11 +42,14 @@ UNKNOWN_TOOL_MASS = 0.1
 
 def require_egm(workcell: Workcell, leader: int) -> None:
     """Check that a cell states the delay of each arm, and that the controller of its
-    force-controlled arm has force control.
+    force-controlled arm has ABB's Force Control.
 
     Args:
         workcell: the cell.
         leader: index of the position-controlled arm.
+
+    Raises:
+        SettingsError: a delay is not stated, or force control is missing.
     """
     robots = workcell.robots
     robot, other = robots[1 - leader], robots[leader]

@@ -188,8 +188,15 @@ def pad_places(workcell: Workcell, arm: int, q: Array) -> Array:
 
 
 def pad_jacobians(workcell: Workcell, arm: int, q: Array) -> Array:
-    """Compute the Jacobians (n, 6, n_joints) of an arm's pad: linear, then angular velocity along
-    the flange's axes per joint velocity [m/rad, 1], at joint positions q (n, n_joints)."""
+    """Compute the Jacobians (n, 6, n_joints) of an arm's pad with respect to its joint positions.
+
+    Linear velocity comes first [m/rad], then angular velocity [1], both along the flange's axes.
+
+    Args:
+        workcell: the cell.
+        arm: index of the arm.
+        q: (n, n_joints) joint positions of this arm [rad or m].
+    """
     robot, found = workcell.robots[arm], np.empty((len(q), 6, q.shape[1]))
     model = build_robot_model(robot)
     data = model.model.createData()
@@ -342,11 +349,12 @@ class Export:
         return contact_torque(first, matrices, np.swapaxes(wrench, 0, 1))
 
     def _of_other(self, contact: Array) -> Array:
-        """Return the torques (n, joints) that the other arm's contact causes in each joint; zero in
-        joints that move one arm only.
+        """Return the torques (n, joints) in joints that move both arms, such as a torso, that the
+        contact of the other arm causes; zero in all other joints.
 
-        A joint that moves both, for instance a torso, has one column per arm. `contact` (n, joints)
-        are the torques by each arm's own contact.
+        Args:
+            contact: (n, joints) torques of each arm's own contact. A joint that moves both arms has
+                one column per arm.
         """
         found, (own, other) = np.zeros_like(contact), self.job.joint_names
         for name in common_joints(self.workcell.robots):

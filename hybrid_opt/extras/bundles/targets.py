@@ -113,6 +113,10 @@ class Target:
     def require_hands(self, workcell: Workcell, name: str) -> None:
         """Check that this target can switch the hands of a cell (cups, magnets or grippers).
 
+        Args:
+            workcell: the cell; without hands it always passes.
+            name: name of the target, for messages.
+
         Raises:
             SettingsError: the target switches no hands, or the names of their outputs are not valid
                 for it.
@@ -125,8 +129,12 @@ class Target:
             self.lines.require(workcell, name)
 
     def stiffness_of(self, job: Job, name: str) -> float | None:
-        """Return the stiffness of each arm at its pad for a job [N/m]; None if the target needs
-        none.
+        """Return the stiffness of each arm at its pad for a job [N/m], from the joint gains or from
+        the cell; None if the cell does not state it and the target needs none.
+
+        Args:
+            job: the job.
+            name: name of the target, for messages.
 
         Raises:
             SettingsError: the target needs a stiffness that is unknown.
@@ -136,11 +144,15 @@ class Target:
         return self.stated_stiffness(job.workcell, name)
 
     def stated_stiffness(self, workcell: Workcell, name: str) -> float | None:
-        """Return the stiffness of each arm at its pad that a cell states [N/m]; None if one is not
-        stated and the target needs none.
+        """Return the stiffness of each arm at its pad that a cell states [N/m]; None if it does not
+        state both and the target needs none.
 
         Both arms hold the box like springs in series, so their stiffnesses k_1 and k_2 are averaged
         to 2 / (1 / k_1 + 1 / k_2).
+
+        Args:
+            workcell: the cell.
+            name: name of the target, for messages.
 
         Raises:
             SettingsError: the target needs a stiffness that is unknown.
@@ -295,11 +307,15 @@ def target_for(name: str, workcell: Workcell) -> Target:
 
 
 def missing_for(name: str, workcell: Workcell, leader: int = 0) -> tuple[str, ...]:
-    """Return sentences on what a cell lacks for a target, as far as this is known without a carry;
-    empty if nothing.
+    """List what a cell lacks for a target, as far as this is known without a carry.
 
     Args:
+        name: name of the target.
+        workcell: the cell.
         leader: index of the position-controlled arm.
+
+    Returns:
+        One sentence per problem, with a remedy; empty if nothing is missing.
 
     Raises:
         SettingsError: the target is unknown.

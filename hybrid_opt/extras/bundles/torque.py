@@ -138,8 +138,11 @@ def require_torque(job: Job) -> None:
 
 
 def joint_stiffness(job: Job) -> Array:
-    """Return the proportional gains (joints,) of the joint controllers, both arms side by side [N
-    m/rad, for sliding joints N/m]."""
+    """Return the proportional gains (joints,) with which the controllers hold the joints, both arms
+    side by side [N m/rad, for sliding joints N/m].
+
+    They follow from torque limits and inertias of the joints.
+    """
     largest = job.workcell.stack_joint_limits("torque_max")
     return np.minimum(GAIN * largest, FASTEST**2 * joint_inertia(job))
 
@@ -278,8 +281,11 @@ def _controllers(
 
 
 def joint_inertia(job: Job) -> Array:
-    """Compute the mean inertia about each joint (joints,) during a job, without the payload, both
-    arms side by side [kg m^2, for sliding joints kg]: the diagonal of the inertia matrices."""
+    """Compute the mean inertia (joints,) about each joint over a job, without the payload [kg m^2,
+    for sliding joints kg].
+
+    These are the diagonal entries of the inertia matrices of both arms, side by side.
+    """
     found, begin = [], 0
     for robot, joints in zip(job.workcell.robots, job.joint_names, strict=True):
         model = build_robot_model(robot).model

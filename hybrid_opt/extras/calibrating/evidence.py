@@ -102,7 +102,7 @@ class Evidence:
     ranges: dict[str, Any] = field(default_factory=dict)
 
     def tell(self, name: str, found: str, key: str = "") -> None:
-        """Add a determined quantity to `entries`.
+        """Add a quantity that the recordings determine to `entries`.
 
         Args:
             name: name of the quantity, for messages.

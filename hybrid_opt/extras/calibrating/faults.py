@@ -77,7 +77,10 @@ class Fault:
 
 
 def recording_faults(workcell: Workcell, run: Recording, motion: PadMotion) -> list[Fault]:
-    """Return the faults of a single run; empty for none.
+    """Return the faults of a single run, such as lost samples, wrong units or frames, and unequal
+    clocks; empty for none.
+
+    Of faults that would mislead the check of the others only the first kind is returned.
 
     Args:
         workcell: the cell.
@@ -267,8 +270,8 @@ def _range_faults(run: Recording) -> list[Fault]:
 
 
 def _pad_faults(workcell: Workcell, run: Recording, motion: PadMotion) -> list[Fault]:
-    """Return faults of pads that are not at their positions on the box during holds, and of normal
-    forces that vanish; empty for none.
+    """Return faults that the holds of a run show: swapped arms, pads that stand beside each other,
+    and normal forces that vanish. The list is empty for none.
 
     Args:
         workcell: the cell.

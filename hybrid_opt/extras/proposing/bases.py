@@ -367,15 +367,12 @@ class BaseScorer:
         return np.asarray((fine & (kept == m)).reshape(len(holds), k).any(axis=0))
 
     def _hidden(self, arm: int, shoulder: Array) -> float:
-        """Compute at how many ends of the carry a body of the environment stands between an arm's
-        shoulder and its contact, seen from above.
+        """Compute for which share of the two ends of the carry, 0, 0.5 or 1, a body of the
+        environment stands between an arm's shoulder and its contact, seen from above.
 
         Args:
             arm: index of the arm.
             shoulder: (3,) position of the shoulder in the world [m].
-
-        Returns:
-            Share of the two ends of the carry: 0, 0.5 or 1.
         """
         point = np.append(np.array(self._problem.contacts[arm]["xyz"], dtype=float), 1.0)
         hit = 0
@@ -396,10 +393,10 @@ class BaseScorer:
 
 
 def _feet(draft: Workcell, arm: int) -> tuple[Piece, ...]:
-    """Return the solids that are fixed to a robot's base, in the base frame.
+    """Return the solids that stand where a robot stands, in its base frame: a cylinder as its foot,
+    and the bodies of the robot that do not move.
 
-    They are a cylinder as the robot's foot, and its fixed bodies. Fixed bodies of a machine with
-    two arms belong to its first arm.
+    Those of a machine with two arms belong to its first arm.
 
     Args:
         draft: the cell.

@@ -17,6 +17,10 @@ def program(name: str) -> str:
 def filled(name: str, **values: object) -> str:
     """Return the text of a template file with its placeholders `$NAME` replaced by values.
 
+    Args:
+        name: name of the file.
+        values: value of each placeholder by NAME.
+
     Raises:
         KeyError: a value is missing.
     """
@@ -28,7 +32,10 @@ SHARED = ("bring_up.py", "carry_job.py", "carry_machine.py", "carry_program.py")
 
 
 def programs(name: str) -> dict[str, str]:
-    """Return a program that runs a job, and the modules that it imports.
+    """Return a program that runs a job, and the modules that it imports, as files of a bundle.
+
+    Args:
+        name: file name of the program.
 
     Returns:
         Text of each file, by its path in the bundle.

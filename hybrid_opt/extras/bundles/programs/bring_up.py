@@ -196,7 +196,7 @@ class Looks:
 
     def speed(self, job: Job, arm: int) -> float:
         """Return the largest measured speed of an arm's pad, divided by the largest planned speed
-        of this pad."""
+        of this pad in the job."""
         reach, found = job.robots[arm]["reach"], [0.0]
         for one, other in zip(self.moving, self.moving[WINDOW:], strict=False):
             passed = other.time - other.age[arm] - one.time + one.age[arm]
@@ -208,8 +208,8 @@ class Looks:
         return max(found) / max(planned)
 
     def late(self, job: Job, arm: int) -> float:
-        """Return the median delay of an arm's measured posture behind the commanded point on the
-        path [s]; NaN without measurements."""
+        """Return the median time [s] by which an arm's measured posture is behind the commanded
+        point on the path; NaN without measurements. Only measurements in fast motion count."""
         fastest, found = max(job.speed(arm, s) for s in job.time), []
         for look in self.moving:
             forward = look.direction
@@ -256,7 +256,14 @@ class Looks:
         return {"sign": sign, "stiffness": 2.0 * slope}
 
     def measured(self, job: Job, arm: int, lead: float) -> Measured:
-        """Return the measured properties of an arm whose commands are sent ahead by `lead` [s]."""
+        """Return the measured properties of an arm.
+
+        Args:
+            job: the job.
+            arm: index of the arm.
+            lead: time by which the program sends the arm's commands ahead, to compensate its delay
+                [s].
+        """
         late = self.late(job, arm)
         found = Measured(lead + late, late, self.speed(job, arm))
         if not self.forces[arm] or not self.pressed:
@@ -305,10 +312,17 @@ def bring_up(
 
 
 def require(folder: Path, job: Job, plan: dict[str, Any]) -> list[Measured]:
-    """Read the measured properties of both arms from a bundle's folder.
+    """Read the measured properties of both arms from a bundle's folder, and compare them with the
+    plan.
+
+    Args:
+        folder: folder of the bundle.
+        job: the job.
+        plan: planned values, as `plan` in the bundle's configuration.
 
     Raises:
-        Refused: nothing was measured, or a value differs too much from the plan.
+        Refused: nothing was measured, the measurements are of another job, or a value differs too
+            much from the plan.
     """
     first = f"python3 {plan['program']} --bring-up first; --in-air drives the job without a box"
     try:

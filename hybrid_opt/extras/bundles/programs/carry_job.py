@@ -243,12 +243,14 @@ class Job:
         return float((1.0 - x) * rows[k] + x * rows[k + 1])
 
     def effort(self, arm: int, gravity: str, s: float, rate: float) -> list[float]:
-        """Return the joint torques of an arm at a planned time, adapted to the rate at which the
-        job runs [N m, for sliding joints N].
+        """Return the planned joint torques of an arm, adapted to the rate at which the job runs [N
+        m, for sliding joints N].
 
         Args:
+            arm: index of the arm.
             gravity: 'with_gravity' or 'without_gravity': whether the torques include the arm's
                 weight.
+            s: planned time [s].
             rate: derivative of the planned time with respect to time; 1 at the planned speed, 0 at
                 rest.
         """
@@ -295,6 +297,8 @@ class Job:
         Of equally near times the one nearest to `s` is returned.
 
         Args:
+            arm: index of the arm.
+            q: measured joint positions [rad or m].
             s: planned time around which to search [s].
             window: range of the search, as the least and the largest value of result minus `s` [s].
             near: distance [m]. If the pad is at most this far from its planned position at `s`, the

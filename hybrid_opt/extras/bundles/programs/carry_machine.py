@@ -73,7 +73,8 @@ class Clock:
         self._from, self._to, self._since = rate, rate, 0.0
 
     def keep(self, low: float, high: float) -> None:
-        """Limit the planned time of the commanded point to a range [s]."""
+        """Let the commanded point stop at the planned times `low` and `high` [s] and not pass
+        them."""
         self._low, self._high = low, high
 
     @property
@@ -97,8 +98,8 @@ class Clock:
             self._takes = self._stop_time if takes is None else takes
 
     def advance(self, dt: float) -> None:
-        """Move the commanded point on for a time step. Dividing the step into several calls changes
-        nothing."""
+        """Move the commanded point on by a time step dt [s]. Several calls with parts of the step
+        give the same result."""
         count = max(1, math.ceil(dt / FINE)) if self.turning else 1
         for _ in range(count):
             self._step(dt / count)
@@ -246,15 +247,24 @@ class Machine:
         return Clock(self.job.end, self.job.limits.stop_time, s, rate)
 
     def hold(self, reason: str) -> None:
-        """Hold the present commanded posture, with the reason why the arms cannot continue."""
+        """Hold the posture that is commanded now.
+
+        Args:
+            reason: reason why the job cannot continue, for messages.
+        """
         self.clock = self._clock(self.clock.s)
         self.state, self.reason = "held", reason
 
     def resume(self, direction: float, seen: Seen) -> None:
-        """Continue a job that is held, in the direction 1 to its end or -1 back to its beginning.
+        """Continue a job that is held.
+
+        Args:
+            direction: 1 forward to its end, -1 back to its beginning.
+            seen: measured state of both arms.
 
         Raises:
-            Refused: the job is not held, or an arm is silent or not where it is held.
+            Refused: the job is not held, it is to go back although the box already stands on its
+                support, a stop is requested, or an arm is silent or not where it is held.
         """
         if self.state != "held":
             raise Refused(f"the job is {self.state}; it goes on only from where it is held")
@@ -270,7 +280,7 @@ class Machine:
 
     @property
     def grip(self) -> bool:
-        """True if hands have to be switched on at the present point of a begun job."""
+        """True if hands are commanded to hold at the present point of the job."""
         return self.job.grips(self.clock.s, self._direction)
 
     def _aim(self, direction: float) -> None:
@@ -448,8 +458,12 @@ class Machine:
                 )
 
     def _wrong(self, seen: Seen) -> str:
-        """Return the reason for which the measured postures and inputs do not allow the job to
-        continue, '' if they do. `_wrong_force` checks the forces."""
+        """Return the reason why the measured state does not allow the job to continue; '' if it
+        does.
+
+        Postures, their age, missing forces and inputs of hands are checked here, the values of
+        forces in `_wrong_force`.
+        """
         limits, s = self.job.limits, self.clock.s
         # Nothing is lifted or let go, and no job done, by an arm that stands elsewhere.
         releases = self.job.phase(s) == "release" and not self.job.is_standing
@@ -494,8 +508,8 @@ class Machine:
         return ""
 
     def _wrong_force(self, seen: Seen) -> str:
-        """Return the reason for which the measured forces do not allow the job to continue, '' if
-        they do."""
+        """Return a text on the first arm whose measured normal force differs too much from the
+        commanded one; '' if there is none."""
         s, lift = self.clock.s, self.job.pressed
         for arm, measured in enumerate(seen.force):
             wanted = self.job.force(arm, s)

@@ -79,14 +79,14 @@ class Press:
     def tick(self, dt: float, wanted: float, soon: float, felt: float | None) -> None:
         """Move the pad for one time step so that the normal force approaches the commanded one.
 
-        The attribute `way`, the distance of the pad beyond its planned position, is changed. It
-        approaches the depth at which the arms' compliance gives the force, corrected by the
-        integral of the measured error. Its speed and depth are bounded.
+        The attribute `way` approaches the depth at which the arms' compliance gives the force,
+        corrected by the integral of the measured error. Its speed and magnitude are bounded.
 
         Args:
+            dt: time since the last call [s].
             wanted: commanded normal force now [N].
             soon: commanded normal force one delay of the arm later [N].
-            felt: measured normal force [N]; None before the first measurement.
+            felt: measured normal force [N]; None if there is none or the integral is to stay.
         """
         if wanted <= 0.0:
             self._missing = 0.0
@@ -100,8 +100,15 @@ class Press:
         self._move(target, self._speed * dt)
 
     def creep(self, dt: float, wanted: float, felt: float) -> None:
-        """Move the pad for one time step at a constant low speed, in the direction that reduces the
-        error of the force, to measure an unknown stiffness."""
+        """Move the pad for one time step at a constant low speed, to measure an unknown stiffness.
+
+        It moves into the block while the measured force is too small, otherwise back.
+
+        Args:
+            dt: time since the last call [s].
+            wanted: commanded normal force [N].
+            felt: measured normal force [N].
+        """
         self._move(self._most if felt < wanted else 0.0, CREEP * dt)
 
     def _move(self, target: float, step: float) -> None:
@@ -171,7 +178,13 @@ class Stream(Carry):
         return Seen(q=q, force=force, age=age, fault=self.fault, lost=self.lost)
 
     def hear(self, arm: int, message: FromRobot, now: float) -> None:
-        """Store the measured state in a message that has arrived from an arm's controller."""
+        """Store the measured state that a message of an arm's controller contains.
+
+        Args:
+            arm: index of the arm.
+            message: the decoded message.
+            now: time of its arrival, on this computer's clock [s].
+        """
         degrees = self._in_chain(arm, message.joints, message.further)
         if degrees is None:
             return
@@ -206,8 +219,17 @@ class Stream(Carry):
         super().check()
 
     def read(self, arm: int, data: bytes, host: str) -> FromRobot | None:
-        """Decode a packet from an arm's controller, sent by a host. Return None, and count the
-        packet, if it is damaged or comes from another host."""
+        """Decode a packet that arrived at an arm's socket.
+
+        Args:
+            arm: index of the arm.
+            data: content of the packet.
+            host: IP address of its sender.
+
+        Returns:
+            The message; None if the packet is damaged or not from the arm's controller. Such
+            packets are counted in `dropped`.
+        """
         if host == self._hosts[arm]:
             with suppress(ValueError):
                 return read_robot(data)
@@ -306,8 +328,9 @@ class Stream(Carry):
 
     def _inward(self, s: float) -> list[float]:
         """Compute how far each joint of the pressing arm turns per metre by which its pad moves
-        into the box, along the contact normal [rad/m]; interpolated linearly between the samples of
-        the job.
+        into the box along the contact normal [rad/m].
+
+        Values at the planned time s [s] are interpolated linearly between the samples of the job.
         """
         rows, time = self.config["inward"], self.job.time
         k = min(max(bisect_left(time, s) - 1, 0), len(rows) - 2)

@@ -73,8 +73,11 @@ def type_of(kind: str) -> Any:
 
 
 def fill(message: Any, values: dict[str, Any]) -> None:
-    """Set the fields of a ROS message from a dictionary; the value of a field that is itself a
-    message is such a dictionary.
+    """Set the fields of a ROS message.
+
+    Args:
+        message: the message, changed in place.
+        values: values by name of the field; a dictionary for a field that is itself a message.
 
     Raises:
         AttributeError: the message has no such field.
@@ -227,8 +230,15 @@ class Run(Carry):
             rclpy.spin_once(self.node, timeout_sec=left)
 
     def wait(self, futures: Sequence[Any], what: str) -> list[Any]:
-        """Wait for ROS futures and return their results, or raise a `Refused` that names what takes
-        longer than `PATIENCE`."""
+        """Wait for ROS futures and return their results.
+
+        Args:
+            futures: the futures.
+            what: name of what has to answer, for messages.
+
+        Raises:
+            Refused: it takes longer than `PATIENCE`.
+        """
         begin = self.now()
         while not all(future.done() for future in futures):
             if self.now() - begin > PATIENCE:
