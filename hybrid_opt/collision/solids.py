@@ -23,7 +23,8 @@ def compiled_distances() -> Any:
     """Load the C++ extension module of distances.
 
     Raises:
-        BridgeError: the module is missing, cannot be loaded, or was compiled against another Coal.
+        BridgeError: the module is missing, cannot be loaded, or was compiled with another version
+            of the library Coal.
     """
     name = "hybrid_opt.collision._distances"
     found = compiled_module(name, "the compiled part of collision checking")

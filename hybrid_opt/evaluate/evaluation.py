@@ -98,7 +98,8 @@ class Evaluations:
         return len(self.x)
 
     def judgement(self, row: int, objective_names: Sequence[str]) -> Judgement:
-        """Return the verdict on one candidate in words.
+        """Return feasibility and objectives of one candidate as a record; if it is infeasible, also
+        the constraint that it violates first and where.
 
         Args:
             row: index of the candidate.

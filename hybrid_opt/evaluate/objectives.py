@@ -105,8 +105,8 @@ def _larger(forces: Evaluate) -> Evaluate:
 
 
 def _peak_forces(outputs: Outputs, workcell: Workcell) -> Array:
-    """Return the peak normal forces (n, 2) of n candidates and both robots, over the reference
-    forces.
+    """Compute the peak normal forces (n, 2) of both robots for n candidates, divided by the
+    reference forces.
 
     The peaks cover the whole path if the timing computes them, else only the samples.
 
@@ -120,8 +120,8 @@ def _peak_forces(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _mean_force(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the time mean (n,) of both normal forces over the mean reference force, for n
-    candidates.
+    """Compute the normal force averaged over time and both robots, divided by the mean reference
+    force, (n,) for n candidates.
 
     Args:
         outputs: outputs of the evaluator by name.
@@ -133,7 +133,7 @@ def _mean_force(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _duration(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute the durations (n,) of n candidates over `duration_unit`.
+    """Compute the durations (n,) of n candidates, divided by `duration_unit`.
 
     Args:
         outputs: outputs of the evaluator by name.
@@ -144,8 +144,8 @@ def _duration(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _peak_torque_use(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute for n candidates the largest joint torque from the contact wrench over the torque
-    limit of the joint, (n,).
+    """Compute the largest ratio (n,), for n candidates, of a joint torque to the joint's torque
+    limit. Only torques of the contact wrenches count.
 
     Args:
         outputs: outputs of the evaluator by name.
@@ -159,8 +159,8 @@ def _peak_torque_use(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _force_imbalance(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute for n candidates the largest difference between the two normal forces, over the mean
-    reference force, (n,).
+    """Compute the largest difference between the two normal forces, divided by the mean reference
+    force, (n,) for n candidates.
 
     Args:
         outputs: outputs of the evaluator by name.
@@ -172,8 +172,8 @@ def _force_imbalance(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _joint_length(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute for n candidates the Euclidean length of both arms' path in joint space over the
-    Euclidean length of the joint ranges, (n,).
+    """Compute the length of the path in the joint space of both arms, divided by the norm of the
+    vector of joint ranges, (n,) for n candidates.
 
     Args:
         outputs: outputs of the evaluator by name.
@@ -203,10 +203,12 @@ def _friction_use(outputs: Outputs, workcell: Workcell) -> Array:
 
 
 def _robust_forces(outputs: Outputs, workcell: Workcell) -> Array:
-    """Compute for n candidates the peak robust force (n, 2) of each arm over its reference force.
+    """Compute the peak robust force (n, 2) of each arm for n candidates, divided by the arm's
+    reference force.
 
-    Arm 1 is position-controlled; arm 2 presses with the commanded force (`hybrid_opt.robust`). The
-    peaks cover the whole path if the timing limits robust forces, else only the samples.
+    Robust forces hold the box in every case of the uncertainty (`hybrid_opt.robust`). Arm 2 presses
+    with the commanded force; the force of arm 1, which is position-controlled, follows. The peaks
+    cover the whole path if the timing limits robust forces, else only the samples.
 
     Args:
         outputs: outputs of the evaluator by name.
