@@ -218,8 +218,9 @@ def residual_moments(data: ReportData) -> Figure:
 
 
 def robust_price(data: ReportData, price: RobustPrice) -> Figure:
-    """Draw the peak normal forces of the recommended carry against the multiple of the
-    uncertainty."""
+    """Draw the peak normal forces that hold the recommended carry in every case of the uncertainty,
+    against a factor on the uncertainty.
+    """
     figure = new_figure(0.5)
     axes = figure.subplots()
     for i, robot in enumerate(data.workcell.robots):

@@ -67,8 +67,9 @@ def fronts(data: ReportData) -> Figure:
 
 
 def attainment(data: ReportData) -> Figure:
-    """Draw empirical attainment surfaces: what a quarter, half and three quarters of the replicas
-    reached or bettered."""
+    """Draw empirical attainment surfaces: the objectives that a quarter, half and three quarters of
+    the replicas reached or improved on.
+    """
     figure = new_figure(0.48)
     groups = {"search": [[run.front.objectives for run in a.runs] for a in data.algorithms]}
     if data.has_hybrid:

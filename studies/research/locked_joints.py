@@ -98,7 +98,7 @@ def _volume(evaluations: Evaluations) -> float:
 
 
 def as_text(found: Sequence[LockedReplica]) -> str:
-    """Return the comparison as text."""
+    """Return the results of `compare` as text."""
     lines = ["replica     free  best lock  locks with a carry  at"]
     for k, one in enumerate(found):
         some = sum(volume > 0.0 for volume in one.locked)

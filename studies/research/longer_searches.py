@@ -214,7 +214,7 @@ def approaches(root: Path, reference: ReferenceFront) -> list[PolishGap]:
 
 
 def approaches_text(found: Sequence[PolishGap]) -> str:
-    """Format the distances as a table."""
+    """Format the results of `approaches` as a table."""
     head = ["medians over the replicas", "HV gap", "polished", "closed %", "IGD", "polished"]
     rows = [
         [
@@ -231,7 +231,7 @@ def approaches_text(found: Sequence[PolishGap]) -> str:
 
 
 def as_text(found: Sequence[LongerSearch]) -> str:
-    """Format the comparison as a table."""
+    """Format the results of `controls` as a table."""
     rows = [["polished front of", "search", "polished", "longer search", "HV", "wins"]]
     rows += [
         [

@@ -411,11 +411,11 @@ def time_against_force(found: StoredRecommendation) -> Table:
 
 
 def robust_price(price: RobustPrice, robots: Sequence[str]) -> Table:
-    """Return the table of a recommended carry's normal forces that hold in multiples of the
-    uncertainty.
+    """Return the table of the peak normal forces that hold the recommended carry in every case of
+    the uncertainty, for several factors on the uncertainty.
 
     Args:
-        price: the forces by multiple.
+        price: the forces by factor.
         robots: names of both robots.
     """
     check, of = price.check, "" if price.uncertainty.stated else ", the usual one"
