@@ -454,7 +454,8 @@ class HoldingHands(ContactModel):
         ]
 
     def squeeze_wrenches(self, leader: int) -> Array:
-        """Return zeros (2, 6) for any leader: more holding force does not press the payload."""
+        """Return zeros (2, 6) for any leader: a hand's holding force acts between hand and payload
+        alone, so more of it does not change the wrench on the payload."""
         return np.zeros((2, 6))
 
     @property
@@ -472,7 +473,7 @@ class HoldingHands(ContactModel):
         return {f"cups {2e3 * LARGER_CUP:.0f} mm larger across at the same vacuum": larger_cup}
 
     def follower(self, leader: int) -> int | None:
-        """Return None for any leader: hands hold by their own force."""
+        """Return None for any leader: hands hold by their own force, so no arm controls a force."""
         return None
 
     def friction_lost(self, apart: Array) -> Array:
@@ -485,13 +486,15 @@ class HoldingHands(ContactModel):
         return 0.0 * apart
 
     def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
-        """Return the worst displacements of the hands under an uncertainty. A displacement of hands
-        counts as an opposite displacement of the centre of mass, so the hands themselves stay in
-        place.
+        """Return how displaced hands enter the worst cases of an uncertainty: as an opposite
+        displacement of the centre of mass, while the hands themselves stay in place.
+
+        Args:
+            uncertainty: ranges of the centre of mass and of the hands' displacements, among others.
 
         Returns:
             Half-widths (3,) of the range of the centre of mass along the box axes, the hands'
-            displacements included [m]; and the only case of displaced hands, zeros (1, 4) [m].
+            displacements included [m]; and one case of displaced hands, zeros (1, 4) [m].
         """
         off = uncertainty.pad_position + uncertainty.apart / 2.0
         return uncertainty.centre_of_mass + off, np.zeros((1, 4))
@@ -523,8 +526,9 @@ class HoldingHands(ContactModel):
         """Return the unit direction (3,) in which the hands of arm `arm` approach the payload, box
         frame.
 
-        Hands approach along their mean normal. The normals of gripper fingers cancel, so fingers
-        approach across their normals, from outside.
+        Hands approach along their mean normal. If the normals cancel, the hands are fingers that
+        grip an edge from both sides; they approach perpendicular to their normals, from outside the
+        payload.
         """
         of_arm = zip(self.workcell.pads, self.workcell.pad_robots, strict=True)
         T = np.array([pad.T_box_pad for pad, robot in of_arm if robot == arm])
@@ -611,8 +615,8 @@ def _to_box(T: Expression) -> Expression:
 
 
 def larger_cup(cup: Contact) -> Contact:
-    """Return a suction cup with a radius larger by `LARGER_CUP`; its holding force grows with its
-    area."""
+    """Return a copy of a suction cup whose radius is larger by `LARGER_CUP` [m] and whose holding
+    force is larger in proportion to its area."""
     radius = cup.patch_radius + LARGER_CUP
     force = cup.holding_force * (radius / cup.patch_radius) ** 2
     return replace(cup, patch_radius=radius, holding_force=force)

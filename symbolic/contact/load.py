@@ -67,7 +67,7 @@ def load_function(workcell: Workcell) -> ca.Function:
     """Build the function of the contact forces and centres of pressure at one sample of the box
     motion.
 
-    Inputs: pose, rate, second_rate (6,), the box pose [m, rad] and its first and second time
+    Inputs: pose (6,) of the box [m, rad]; rate and second_rate (6,), its first and second time
     derivative; then the payload's symbolic parameters. Outputs, listed with shapes in
     `LOAD_OUTPUTS`: angular velocity and acceleration, normal, tangential and contact forces, shifts
     of the centres of pressure, required and unbalanced moments, and the wrench of each robot.
@@ -110,9 +110,9 @@ def uncertain_load_function(workcell: Workcell) -> ca.Function:
     """Build the function of contact forces at one sample, with friction and centre of mass as
     inputs.
 
-    Inputs: pose, rate, second_rate (6,), the box pose and its time derivatives; friction (2,), the
-    Coulomb coefficients; centre_of_mass (3,), box frame [m]; then the payload's symbolic
-    parameters. Outputs: as `load_function`.
+    Inputs: pose (6,) of the box [m, rad]; rate and second_rate (6,), its first and second time
+    derivative; friction (2,), the Coulomb coefficients; centre_of_mass (3,), box frame [m]; then
+    the payload's symbolic parameters. Outputs: as `load_function`.
     """
     if contact_model(workcell).has_closed_form:
         return _closed_load_function(workcell)

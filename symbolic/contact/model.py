@@ -209,7 +209,7 @@ class ContactModel(ABC):
 
     def friction_use(self, normal: Array, tangential: Array) -> Array:
         """Compute for each of n motions how much of the friction is used if the arms press as hard
-        as their reference forces allow, (n,). A value above 1 means that the payload slides.
+        as their reference forces allow, (n,). Above 1, even these forces do not hold the payload.
 
         At their least normal forces, pads always use the whole friction. Therefore both normal
         forces are raised equally, up to the smaller reference force. The needed friction
@@ -263,8 +263,11 @@ class ContactModel(ABC):
         return held.normal
 
     def planned_quantities(self, found: Mapping[str, Array]) -> Array:
-        """Compute the two `force_quantities` (n, 2) [N] at n samples from arrays `found`, named as
-        in `LOAD_OUTPUTS`."""
+        """Compute the two `force_quantities` (n, 2) [N] at the n samples of an evaluated carry.
+
+        Args:
+            found: arrays of n samples by name, as in `LOAD_OUTPUTS`.
+        """
         return found["normal_force"]
 
     # --- worst cases ---
@@ -300,13 +303,18 @@ class ContactModel(ABC):
         return apart / self.workcell.pad_distance
 
     def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
-        """Return the worst displacements of the pads under an uncertainty.
+        """Return how displaced pads enter the worst cases of an uncertainty: as a shift of the
+        centre of mass, or as cases of their own.
+
+        Args:
+            uncertainty: ranges of the centre of mass and of the pads' displacements, among others.
 
         Returns:
             Half-widths (3,) of the range of the centre of mass along the box axes [m]. They include
             displacements that both pads have in common, which shift the centre of mass relative to
             the pads. Then k cases (k, 4) of the pads' displacements along their tangents, two
-            entries per robot [m].
+            entries per robot [m]; by default one case of zeros, because `least_friction` covers
+            opposite displacements.
         """
         normal = self.workcell.contacts[0].T_box_pad[:3, 2]
         across = np.sqrt(np.maximum(1.0 - normal**2, 0.0))

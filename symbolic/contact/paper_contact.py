@@ -87,8 +87,8 @@ class PaperContact(ContactModel):
         """Compute the normal component F_n and the tangential magnitude F_t of the required force.
 
         Args:
-            load: load on both contacts.
-            held: contact forces, which are not needed.
+            load: load on both contacts, of which only the force is used.
+            held: not used.
 
         Returns:
             (2,) F_n and F_t [N].

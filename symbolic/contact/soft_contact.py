@@ -132,13 +132,16 @@ class SoftFingerGrasp(SoftFinger):
         return 0.0 * apart
 
     def worst_displacements(self, uncertainty: Uncertainty) -> tuple[Array, Array]:
-        """Return the worst displacements of the pads under an uncertainty.
+        """Return how displaced pads enter the worst cases of an uncertainty.
+
+        Args:
+            uncertainty: ranges of the centre of mass and of the pads' displacements, among others.
 
         Returns:
-            Half-widths (3,) of the range of the centre of mass along the box axes [m]; and k cases
-            (k, 4) of displacements along the pads' tangents, two entries per robot [m]. The cases
-            are the corners of squares around the discs within which pads may be displaced; to first
-            order no displacements are worse.
+            Half-widths (3,) of the range of the centre of mass along the box axes, without
+            displacements of the pads [m]; and k cases (k, 4) of displacements along the pads'
+            tangents, two entries per robot [m]. The cases are the corners of squares around the
+            discs within which pads may be displaced; to first order no displacements are worse.
         """
         off = uncertainty.pad_position + uncertainty.apart / 2.0
         signs = product((-1.0, 1.0) if off > 0.0 else (0.0,), repeat=4)

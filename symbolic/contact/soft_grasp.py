@@ -125,8 +125,12 @@ class SoftGrasp:
         )
 
     def slopes(self) -> ca.Function:
-        """Build the function from the states (size,) of all patches to the normal forces (2,) of
-        the robots [N] and the derivatives (6, 2) of these forces by the load."""
+        """Build the function that computes the normal forces of the robots at a solution of the
+        convex program, and their derivatives.
+
+        Input: the states (size,) of all patches. Outputs: normal forces (2,) [N]; and their
+        derivatives (6, 2) by the load.
+        """
         state = ca.SX.sym("state", self.size)
         by_load = _Local(self, state).by_load()
         outputs = [ca.mtimes(self.normals, state), ca.mtimes(self.normals, by_load).T]

@@ -308,8 +308,8 @@ class DistanceBounds:
         return axial + size[0]
 
     def _seen(self, frame: Frame, axes: Axes) -> tuple[ca.SX, ca.SX]:
-        """Compute a frame's rotation (3, 3), and its origin (3,) [m] relative to the world's
-        origin, in coordinates along three directions.
+        """Compute the pose of a frame in coordinates along three directions: rotation (3, 3), and
+        position (3,) of its origin relative to the world's [m].
 
         Args:
             frame: the frame.

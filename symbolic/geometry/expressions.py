@@ -63,30 +63,38 @@ class Softness:
         return (x + ca.sqrt(x * x + self.width**2)) / 2.0 if self.width else ca.fmax(x, 0.0)
 
     def maximum_above(self, values: Sequence[ca.SX]) -> ca.SX:
-        """Compute a smooth upper bound of the largest of several values."""
+        """Compute a smooth upper bound of the largest of n values, at most (n - 1) / 2 times
+        `width` larger."""
         return _fold(self._pair_above if self.width else ca.fmax, values)
 
     def maximum_below(self, values: Sequence[ca.SX]) -> ca.SX:
-        """Compute a smooth lower bound of the largest of several values."""
+        """Compute a smooth lower bound of the largest of n values, at most (n - 1) / 2 times
+        `width` smaller."""
         if not self.width:
             return _fold(ca.fmax, values)
         return _fold(lambda a, b: self._pair_above(a, b) - self.width / 2.0, values)
 
     def minimum_below(self, values: Sequence[ca.SX]) -> ca.SX:
-        """Compute a smooth lower bound of the least of several values."""
+        """Compute a smooth lower bound of the least of n values, at most (n - 1) / 2 times `width`
+        smaller."""
         if not self.width:
             return _fold(ca.fmin, values)
         return -self.maximum_above([-value for value in values])
 
     def norm_below(self, squared: ca.SX) -> ca.SX:
-        """Compute a smooth lower bound of a length [m] from its square [m^2]."""
+        """Compute a smooth lower bound of a length [m], at most `width` smaller, from the squared
+        length [m^2]."""
         if self.width:
             return ca.sqrt(squared + self.width**2) - self.width
         return ca.sqrt(ca.fmax(squared, _TINY)) - _TINY**0.5
 
     def cosine_above(self, sine: ca.SX) -> ca.SX:
-        """Compute a smooth upper bound of sqrt(1 - sine^2), the absolute cosine that belongs to a
-        sine."""
+        """Compute a smooth upper bound of the absolute cosine of an angle, sqrt(1 - sine^2), at
+        most `width` larger.
+
+        Args:
+            sine: sine of the angle.
+        """
         rest = 1.0 - sine * sine
         if self.width:
             # 1 - sine^2 may be -1e-16 by roundoff; the width keeps the root's argument positive.

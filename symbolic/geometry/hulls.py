@@ -297,9 +297,9 @@ START_DIRECTIONS = np.array([u for u in product((-1.0, 0.0, 1.0), repeat=3) if a
 def simplify(hulls: list[Hull]) -> tuple[Hull, ...]:
     """Return fewer hulls with fewer corners, whose union contains all given hulls.
 
-    A hull inside another hull is dropped. The common hull replaces two hulls if the smaller one
-    stands out from the larger one by at most `STAND_OUT`, or if both together are at most
-    `SMALL_PART` long. `thin` then removes corners of each hull.
+    A hull inside another hull is dropped. Two hulls are merged into their common hull if the
+    smaller one stands out from the larger one by at most `STAND_OUT`, or if both fit into a cube
+    with the edge `SMALL_PART`. Then corners of each hull are removed (`thin`).
     """
     kept: dict[int, _Growth] = {}
     volumes = [hull_volume(hull.vertices[hull.faces]) for hull in hulls]

@@ -260,8 +260,8 @@ _BOUNDS = ("lower", "upper")
 
 
 def refined_task(task: Task) -> Task:
-    """Return the task with `task.pieces` - 1 free waypoints added between each two waypoints of its
-    file.
+    """Return the task with `task.pieces` - 1 free waypoints added between any two neighbouring
+    waypoints of its file.
 
     The bounds of the added waypoints admit every path that the bounds in the file admit.
     """

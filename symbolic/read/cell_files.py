@@ -398,7 +398,8 @@ class CellCollector:
         return f"embedded/{self._moved}/{name or 'folder'}"
 
     def _with_meshes(self, robot: Robot, place: str, packages: list[tuple[Path, str]]) -> bytes:
-        """Add the meshes of a robot's URDF, and return the URDF with absolute addresses replaced.
+        """Add the meshes of a robot's URDF, and return the URDF with all mesh addresses valid among
+        the collected files.
 
         Args:
             robot: the robot.

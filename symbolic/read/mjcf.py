@@ -267,7 +267,13 @@ def _add(
 
 
 def read_mjcf(path: Path, found: SceneBuilder) -> None:
-    """Add the shapes of an MJCF file's world and fixed bodies to `found`, as MuJoCo poses them."""
+    """Add the shapes of an MJCF file's world and of its fixed bodies to a scene, at their poses in
+    MuJoCo's initial configuration.
+
+    Args:
+        path: the file.
+        found: collector of bodies.
+    """
     mujoco, _, model = compiled(path)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)

@@ -316,7 +316,8 @@ def _warn_nominal(robot: str, argument: str) -> None:
 
 
 def _argument(value: str, folder: Path) -> str:
-    """Return the value of a xacro argument, with a path relative to `folder` made absolute."""
+    """Return the value of a xacro argument. A value that begins like a relative path is resolved
+    relative to `folder`; any other value is returned unchanged."""
     return str((folder / value).resolve()) if value.startswith(RELATIVE) else value
 
 

@@ -140,7 +140,8 @@ class _Sdf:
         self._files = 0
 
     def read(self, path: Path) -> None:
-        """Add the first world of a file, or the file's models if it has no world."""
+        """Add the shapes of an SDF file to the scene: those of its first world, or of all its
+        models if it has no world."""
         root = self._root(path, found_in="")
         worlds = list(root.named("world").values())
         for further in worlds[1:]:

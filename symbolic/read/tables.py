@@ -118,7 +118,7 @@ class TableReader:
             self.add(key, f"found beside {beside}; allowed is one or the other")
 
     def close(self) -> None:
-        """Record a problem for every key of the table that no method has read."""
+        """Record every key of the table that was not read before as a problem: an unknown key."""
         unknown = [key for key in self._data if key not in self._known]
         allowed = ", ".join(sorted(self._known))
         for key in unknown[:MOST_UNKNOWN]:
@@ -131,7 +131,7 @@ class TableReader:
             )
 
     def value(self, key: str, kind: Any, default: Any = _REQUIRED) -> Any:
-        """Read a value, checked and converted by `checked`.
+        """Read a value, checked and converted by `checked`; after a problem a valid placeholder.
 
         Args:
             key: key of the value.
@@ -336,7 +336,8 @@ def checked(kind: Any, value: Any, path: str, problems: Problems) -> Any:
 
 
 def _single(kind: Any, marks: Sequence[Any], value: Any, path: str, problems: Problems) -> Any:
-    """Return a number, text, word of a list, or boolean; after a problem a valid placeholder.
+    """Return a value that has to be a number, a text, one of some words, or a boolean; after a
+    problem a valid placeholder.
 
     Args:
         kind: type that is allowed.

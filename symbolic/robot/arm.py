@@ -251,7 +251,7 @@ def _track_parts(robot: Robot, model: RobotModel, contact: Contact) -> dict[str,
 
 
 def _placed(model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX) -> list[ca.SX]:
-    """Return joint positions together with the pose residual and the flange's Jacobian at them.
+    """Compute how well joint positions place the flange.
 
     Args:
         model: model of the robot.
@@ -259,7 +259,8 @@ def _placed(model: RobotModel, q: ca.SX, R_target: ca.SX, p_target: ca.SX) -> li
         R_target, p_target: wanted rotation (3, 3) and position (3,) [m] of the flange in the root.
 
     Returns:
-        q unchanged; the residual, a scalar [m, rad]; and the Jacobian (6, n).
+        q unchanged; the pose residual, a scalar [m, rad] (`pose_error`); and the flange's Jacobian
+        (6, n) at q.
     """
     R, p, jacobian = model.kinematics(q)
     return [q, pose_error(R_target, p_target, R, p)[1], jacobian]

@@ -151,7 +151,8 @@ def interpreted_search(
 
 
 def interpreted_approach(model: RobotModel) -> Approach:
-    """Build an arm's function of Newton steps (type `Approach`) with CasADi's interpreter."""
+    """Build an arm's function of Newton steps, called as the type `Approach` describes and
+    evaluated by CasADi's interpreter instead of compiled code."""
     function = approach_function(model, "approach")
 
     def approach(q: Array, rotation: Array, position: Array) -> Mapping[str, Array]:
@@ -271,8 +272,8 @@ def _distinct(q: Array) -> Array:
 
 
 def _central_turns(robot: Robot, model: RobotModel, least: Array, greatest: Array) -> Array:
-    """Compute the full turns [rad] by which to shift joint paths, so that the middle of each path
-    is as near as possible to the middle of the joint's limits.
+    """Compute by how many full turns to shift each joint path, so that its middle comes as near as
+    possible to the middle of the joint's limits.
 
     The shifts of prismatic and redundant joints are zero.
 
@@ -282,7 +283,7 @@ def _central_turns(robot: Robot, model: RobotModel, least: Array, greatest: Arra
         least, greatest: (n,) or (m, n) least and greatest position of each joint on its path [rad].
 
     Returns:
-        Shifts, multiples of 2 pi, of the shape of `least`.
+        Shifts [rad], multiples of 2 pi, of the shape of `least`.
     """
     middle = (robot.position_lower + robot.position_upper) / 2.0
     free = [turns and k in model.following for k, turns in enumerate(model.turning)]

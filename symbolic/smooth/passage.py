@@ -129,7 +129,8 @@ class SeparatingAxisGap(PathConstraint):
     scale: ClassVar[float] = 0.01
 
     def expression(self, point: PathPointSymbols, numbers: ca.SX) -> ca.SX:
-        """Build the expression of the gap [m].
+        """Build the expression of the gap along the constraint's direction [m], negative if payload
+        and obstacle overlap along it.
 
         Args:
             point: symbols of the box pose and the joints at one point of the path.
@@ -204,12 +205,12 @@ class AxisSwitchGap(PathConstraint):
 
 def gap_function(point: PathPointSymbols) -> ca.Function:
     """Build the function of the gaps between the payload and a box-shaped obstacle along all
-    separating directions, with exact kinks.
+    separating directions, without smoothing.
 
-    Inputs: pose (6,) of the box; obstacle (BOX_NUMBERS,); then the symbolic parameters of the
-    bodies. Output: gaps (SEPARATING_DIRECTIONS,) [m]. The largest gap never exceeds the distance of
-    the two bodies. For a box-shaped payload it is positive if the bodies are disjoint, except where
-    edges are nearly parallel.
+    Inputs: pose (6,) of the box; obstacle (BOX_NUMBERS,), as from `box_numbers`; then the symbolic
+    parameters of the bodies. Output: gaps (SEPARATING_DIRECTIONS,) [m]. The largest gap never
+    exceeds the distance of the two bodies. For a box-shaped payload it is positive if the bodies
+    are disjoint, except where edges are nearly parallel.
     """
     obstacle = ca.SX.sym("obstacle", BOX_NUMBERS)
     rotation = ca.reshape(obstacle[:9], 3, 3).T

@@ -86,7 +86,7 @@ class PathPointSymbols:
 
     @cached_property
     def sharp_scene(self) -> DistanceBounds:
-        """Lower bounds of the distances of all pairs of bodies, with exact kinks."""
+        """Lower bounds of the distances of all pairs of bodies, without smoothing."""
         return self._scene(EXACT)
 
     def _scene(self, softness: Softness) -> DistanceBounds:
