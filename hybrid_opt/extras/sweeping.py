@@ -135,15 +135,16 @@ def sweep(
         cell: drivable cell, see `Cell.drivable`.
         path: good carry of the cell, such as the recommended one, or the carry's decision vector.
         over: values to combine, by key path as for `Cell.changed`.
-        fixed: True to keep the path; False to polish the path in every changed cell.
+        fixed: True to keep the path and to choose only its force limit anew; False to polish the
+            path in every changed cell.
         file: file that stores finished combinations, to resume the sweep; None for no file.
         jobs: number of worker processes, 0 for one per core; has no influence on the result.
         progress: True for a progress bar, or a function that is called with the number of finished
             combinations and their total.
 
     Raises:
-        SettingsError: the cell has another time law, the path does not fit it, there are no values,
-            or the file is about something else.
+        SettingsError: the cell is not drivable, the path does not fit it, there are no values, or
+            the file has the sweep of another cell or other values.
         WorkcellError: the cell has no such key.
     """
     x = np.asarray(path.x if isinstance(path, Carry) else path, dtype=float)
@@ -211,10 +212,11 @@ class _Chains:
         return [values for values in every if values not in self.done]
 
     def near(self, values: tuple[float, ...]) -> Array | None:
-        """Return the carry of a finished combination that is similar to a given one.
+        """Return the carry of a finished combination that is similar to a given one, as a start for
+        it.
 
-        It differs in the value of the last key only. Of the values listed before the given one, the
-        last with a carry is taken.
+        Only the value of the last key differs. Of the values that stand before the given one in the
+        list of this key, the nearest one in the list whose combination has a carry is taken.
 
         Args:
             values: values of the given combination, in the order of the keys.
@@ -318,14 +320,16 @@ def _row(
 
 
 def _tried(cell: Cell, near: Sequence[Array], fixed: bool) -> Evaluations:
-    """Evaluate paths in a changed cell, each with its best force limit.
+    """Evaluate paths in a changed cell, each with the force limit of the least product of duration
+    and commanded force.
 
-    The hand-made path is evaluated with them, unless `fixed` is True.
+    If no path keeps the robots' reference forces with any limit, the limits with the least
+    commanded forces are taken.
 
     Args:
         cell: the changed cell.
         near: decision vectors (n_var,) of the paths.
-        fixed: True if the path may not be replaced by another one.
+        fixed: True to evaluate only these paths; False to evaluate the hand-made path too.
     """
     x = np.array([x[:-1] for x in (near if fixed else [*near, cell.initial])])
     paths = DrivenPaths(cell, x)

@@ -119,8 +119,8 @@ class Session:
         return self.verdict.cell or self._drivable
 
     def change(self, changes: Mapping[str, Any]) -> SessionVerdict:
-        """Change the cell further and evaluate the carry. A refused change leaves the session
-        unchanged.
+        """Change further values of the cell, in addition to earlier changes, and evaluate the
+        carry. A refused change leaves the session unchanged.
 
         Args:
             changes: new values by key path of the workcell file; the key 'force_limit' stands for
@@ -154,8 +154,8 @@ class Session:
     def optimise(
         self, rng: np.random.Generator, evaluations: int = SEARCH_EVALUATIONS
     ) -> SessionVerdict:
-        """Search near the present carry for a carry with a smaller product of duration and force.
-        The result becomes the present carry, and its verdict is returned.
+        """Search near the present carry for a carry with a smaller product of duration and force,
+        make the best one found the present carry, and return its verdict.
 
         Args:
             rng: random generator of the search.
@@ -362,8 +362,8 @@ class Workbench:
         self._thread.start()
 
     def ask(self, changes: dict[str, Any]) -> None:
-        """Request an evaluation with changed values. Of several requests that wait, only the last
-        value of each key counts.
+        """Request an evaluation with changed values. Requests that come before the evaluation
+        begins are merged; of each key the last value counts.
 
         Args:
             changes: new values by key path of the workcell file.

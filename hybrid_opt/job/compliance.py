@@ -104,12 +104,16 @@ class Skew:
 
 
 def position_control(job: Job, stiffness: float) -> PositionControl:
-    """Compute the contact forces of a job if both arms are position controlled instead of one being
-    force controlled.
+    """Compute what position control of both arms would mean for the contact forces of a job, in
+    which one arm is planned to be force controlled.
 
     Args:
         job: the whole job.
         stiffness: stiffness of each arm at its pad [N/m].
+
+    Returns:
+        Depth at which the arms have to aim inside the box to exert the commanded forces, and the
+        changes of force by position errors.
 
     Raises:
         SettingsError: the stiffness is not positive.
@@ -230,7 +234,7 @@ def require_skew(job: Job, delay: float, stiffness: float) -> None:
 
 
 def _displacement(job: Job, phase: Phase, late: int, delay: float) -> tuple[Array, Array, Array]:
-    """Compute how the pad of an arm is displaced from its planned position if that arm is late.
+    """Compute how far the pad of a late arm lags behind its planned position.
 
     Args:
         job: the whole job.
@@ -239,9 +243,10 @@ def _displacement(job: Job, phase: Phase, late: int, delay: float) -> tuple[Arra
         delay: time by which the arm is late [s].
 
     Returns:
-        - Mask (m,), False for samples that repeat the time of the sample before; n samples remain.
-        - Displacement (n, 3) [m] of the late pad at the remaining samples, world frame.
-        - Contact normal (n, 3) of the late pad at these samples, world frame.
+        - Mask (m,) of the n samples at which the displacement is computed: all but those with the
+          same time as the sample before.
+        - Displacement (n, 3) of the late pad from its planned position, world frame [m].
+        - Normal (n, 3) of the late pad, world frame.
     """
     motion, contact = phase.motion, job.workcell.contacts[late]
     keep = np.concatenate([[True], np.diff(motion.time) > 0.0])

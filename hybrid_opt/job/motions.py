@@ -120,12 +120,14 @@ class Straight:
     def at(self, share: Array) -> tuple[Array, Array, Array]:
         """Compute the poses of box and pads at points of the line.
 
+        The pose of a pad is stated as the pose that the box would have if the pad touched it at the
+        contact point.
+
         Args:
             share: (n,) points, from 0 at the beginning to 1 at the end of the line.
 
         Returns:
-            Poses (n, 6) of the box [m, rad]. Then for each arm the positions of its pad, stated as
-            the box poses (n, 6) at which the pad would touch the box there [m, rad].
+            Poses (n, 6) of the box, of the pad of arm 1, and of the pad of arm 2 [m, rad].
         """
         ways = np.concatenate([self.box[None], self.held])
         poses = ways[:, None, 0] + share[:, None] * (ways[:, 1] - ways[:, 0])[:, None]
@@ -479,17 +481,20 @@ def unit_squeeze(workcell: Workcell, pose: Array, leader: int = 0) -> Array:
 def phase_use(
     workcell: Workcell, motion: PhaseMotion, force: Force, jerk: JerkLimits | None = None
 ) -> dict[str, float]:
-    """Compute how far each limit that applies to every phase is used: the largest ratio of value to
-    limit, by name of the limit.
+    """Compute the largest ratio of value to limit in a phase, for each limit that applies to every
+    phase.
 
     Joint torques are those of the arms' motion and weight plus those of the commanded contact
     wrenches. Friction and pressure are not included: the timing checks them with the planned
-    forces, and pressing harder only reduces their use.
+    forces, and pressing harder only reduces their ratios.
 
     Args:
         workcell: the workcell.
         motion, force: motion and forces of the phase.
         jerk: limits on jerk; None for no such limits.
+
+    Returns:
+        Ratios by name of the limit; above 1 the limit is exceeded.
     """
 
     effort = motion.own_torque + motion.contact_effort(force.wrench)

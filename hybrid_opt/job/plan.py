@@ -299,7 +299,8 @@ def describe_obstruction(
     pose: Array,
     q: Array,
 ) -> str:
-    """Describe the first straight motion around a carry that collides or leaves an arm's reach.
+    """Describe the first straight motion before or after a carry that collides or leaves an arm's
+    reach.
 
     The result is '' if every motion is reached and free of collisions at the checked samples.
 
@@ -373,15 +374,17 @@ class JobModel:
     ) -> Job:
         """Plan the whole job around a timed carry.
 
+        Jumps of acceleration at the ends of the timing are removed first. If the workcell limits
+        jerk and `within_jerk` is True, the carry is timed anew within these limits, which takes
+        about a second. Otherwise the timing is averaged over a moving window.
+
         Args:
             timing: drivable timing of a carry of this workcell.
             squeeze: settings of the commanded forces; None for the defaults.
-            smoothing: half the width of the window over which a timing with jumps of acceleration
-                is averaged [s]; zero keeps it unchanged. In a workcell with limits on jerk, any
-                other value gives a timing within these limits instead.
+            smoothing: half the width of the moving window [s]; 0 to keep the timing unchanged, also
+                in a workcell that limits jerk.
             handling: heights, speeds and stand-off of the job; None for the workcell's own.
-            within_jerk: True to time the carry within the workcell's limits on jerk, in about a
-                second; False to average its accelerations.
+            within_jerk: False to ignore the workcell's limits on jerk.
 
         Raises:
             SettingsError: the timing failed, or the squeeze is not possible.
@@ -550,12 +553,16 @@ class CommandedForces:
 def command_forces(
     model: JobModel, timing: Timing, settings: SqueezeSettings | None = None
 ) -> CommandedForces:
-    """Compute the normal forces to command along a timed carry, as its job commands them.
+    """Compute the normal forces to command along a timed carry: those of its job or, if no job is
+    possible, those of the carry alone.
 
     Args:
         model: job planner of the carry's workcell.
         timing: timing of the carry, without jumps of acceleration.
         settings: settings of the commanded forces; None for the defaults.
+
+    Returns:
+        The forces, with the job, or with the reason why there is none.
 
     Raises:
         SettingsError: the timing failed, or the uncertainty leaves no friction or patch.
@@ -594,7 +601,9 @@ def plan_job(
     Args:
         timing: drivable timing, or an object with one.
         squeeze: settings of the commanded forces; None for the defaults.
-        smoothing: half the width of the window over which jumps of acceleration are averaged [s].
+        smoothing: half the width of the window over which a timing with jumps of acceleration is
+            averaged [s]; 0 to keep such a timing. In a workcell with limits on jerk any other value
+            has no effect, because the carry is then timed anew within these limits.
 
     Raises:
         SettingsError: the timing failed, or the squeeze is not possible.

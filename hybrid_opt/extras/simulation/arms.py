@@ -474,8 +474,8 @@ class CarrySimulation:
 def simulate_carry(
     cell: Cell, carry: Carry, witness: CellSimulation, control: Control = "leader", leader: int = 0
 ) -> CarrySimulation:
-    """Find the least factor of a carry's planned forces that holds the box, and simulate the carry
-    with the commanded forces of a job.
+    """Simulate a carry in two ways: with multiples of its planned forces, to find the least one
+    that holds the box, and once with the commanded forces of its job.
 
     Args:
         cell: the cell.

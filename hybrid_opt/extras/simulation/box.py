@@ -111,8 +111,7 @@ class Threshold(Generic[AnyOutcome]):
 def bisected(
     simulate: Callable[[float], AnyOutcome], low: float, high: float, steps: int
 ) -> Threshold[AnyOutcome]:
-    """Find by bisection the least factor on the forces with which the box does not slip in a
-    simulation.
+    """Find by bisection the least factor on the forces at which the box does not slip.
 
     Args:
         simulate: function that runs a simulation with a factor and returns its outcome.
@@ -121,8 +120,8 @@ def bisected(
         steps: number of bisections.
 
     Returns:
-        The outcome with the largest factor found at which the box slips, and the one with the least
-        factor found at which it does not.
+        The two simulations between whose factors the least factor lies: one in which the box slips,
+        and one in which it does not.
 
     Raises:
         SimulationError: the box does not slip at `low`, or slips at `high`.
@@ -304,11 +303,11 @@ def drive_of(
     Args:
         carry: the carry at n samples.
         settings: settings of the simulation.
-        press: (n,) pressing force at the samples [N]; None for the planned normal force of the arm
-            other than `leader`.
-        leader: index of the arm whose pad is fixed to the carriage.
-        moments: moments from `planned_moments` that rotate the pads about their centres; None for
-            none.
+        press: (n,) normal force of the sliding pad, that of the arm other than `leader`, at the
+            samples [N]; None for the planned normal force of this arm.
+        leader: index of the arm whose pad is fixed to the carriage, the body that bears both pads.
+        moments: moments from `planned_moments`, with which the pads press unevenly; None for pads
+            without moments.
 
     Raises:
         SettingsError: the carry does not start and end at rest, or `press` has another shape.

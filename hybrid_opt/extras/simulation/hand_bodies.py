@@ -82,8 +82,9 @@ class HandSprings:
 
     @property
     def compliances(self) -> Array:
-        """(2, 6, 6) displacement of the payload by its wrench on the hands of one arm, both about
-        the box frame [m/N, 1/N, rad/(N m)]."""
+        """(2, 6, 6) compliance of each arm with its hands: displacement of the payload per wrench
+        on the hands of this arm alone, both about the box frame [m/N, 1/N, rad/(N m)].
+        """
         found = []
         for contact, middle in zip(self.workcell.contacts, self.middles, strict=True):
             maps = [(wrench_to_box(hand), layer_stiffness(hand)) for hand in _all(contact)]
@@ -97,16 +98,18 @@ class HandSprings:
         return np.array(found)
 
     def displacement(self, opposed: ArrayLike, turned: ArrayLike) -> Array:
-        """Compute how far the second arm is to be displaced so that the arms work against each
-        other.
+        """Compute how far the second arm has to be displaced for the arms to work against each
+        other with a given force.
 
         Args:
-            opposed: (3,) force of the second arm's hands on the payload that its displacement
-                without the rotation is to cause, box frame [N].
-            turned: (3,) rotation of the second arm about the middle of its hands, box frame [rad].
+            opposed: (3,) force of the second arm's hands on the payload, box frame [N]. The
+                displacement causes it if the arm is not rotated.
+            turned: (3,) additional rotation of the second arm about the middle of its hands, box
+                frame [rad]. It is returned unchanged.
 
         Returns:
-            (6,) displacement of the middle of its hands [m] and rotation [rad], box frame.
+            (6,) displacement of the middle of the second arm's hands [m], then the rotation [rad],
+            box frame.
         """
         series = np.linalg.inv(self.compliances.sum(axis=0))
         moved = np.linalg.solve(series[:3, :3], np.asarray(opposed, dtype=float))
@@ -171,8 +174,8 @@ class HandSprings:
       </body>"""
 
     def own_forces(self, motion: CarriageMotion) -> dict[str, Array]:
-        """Compute the forces at the hands' joints that accelerate the hands' own inertia, so that
-        this inertia does not load the springs.
+        """Compute the forces that accelerate the hands' own inertia along their joints. Applied in
+        the simulation, they keep this inertia from loading the springs.
 
         The inertia of the arms needs no such forces: it displaces both arms equally, which loads no
         hand.
@@ -181,7 +184,7 @@ class HandSprings:
             motion: motion at n time steps of the carriage, the body that bears all hands.
 
         Returns:
-            Forces (n,) [N, N m] by name of the joint.
+            Forces (n,) [N] or moments (n,) [N m] by name of the joint.
         """
         found = dict[str, Array]()
         for k, hand in enumerate(self.workcell.pads):

@@ -60,7 +60,7 @@ class HandCase:
 
     @classmethod
     def of(cls, workcell: Workcell, case: Array, direction: Array, turned: Array) -> HandCase:
-        """Return a case from its numbers.
+        """Build a case from a row of values of the uncertain quantities.
 
         Args:
             workcell: the nominal cell.
@@ -77,10 +77,10 @@ class HandCase:
         """Simulate a carry in this case.
 
         Args:
-            motion: motion of the carriage.
-            holding: (2,) nominal holding force of each robot's hands [N]. The share `left` of it
-                acts.
-            factor: number by which the holding forces are multiplied.
+            motion: motion of the carriage, the body that bears all hands.
+            holding: (2,) nominal holding force of each robot's hands [N]. In this case only the
+                share `left` of it acts.
+            factor: further number by which the holding forces are multiplied.
             settings: settings of the simulation.
         """
         stiffness = self.workcell.uncertainty.stiffness
@@ -112,12 +112,12 @@ def worst_hand_case(carry: Carry, model: RobustModel) -> HandCase:
     """Return the case of a cell's uncertainty in which its contact model needs the largest holding
     force along a carry.
 
-    At the sample that needs it, the arms push against each other in the direction that raises the
-    needed force of a hand most.
+    The arms push against each other in the direction that raises the needed force of a hand most,
+    at the sample with the largest needed force.
 
     Args:
         carry: the carry.
-        model: computes the forces that hold the cases of its cell.
+        model: computes the holding forces that are needed in the cases of the cell's uncertainty.
     """
     workcell = carry.workcell
     cases, motion = model.worst_cases(workcell.uncertainty, LEADER), subsample(carry)[1]
@@ -154,14 +154,14 @@ def hand_case_threshold(
 
 
 def _needed_share(workcell: Workcell, case: Array, load: Array, directions: Array) -> Array:
-    """Compute the share (n,) of their holding force that the hands need in a case, the largest of
-    all hands.
+    """Compute the largest ratio (n,) of needed to available holding force over all hands in a case,
+    for each of n directions in which the arms work against each other.
 
     Args:
         workcell: the cell.
-        case: (18,) the case.
+        case: (18,) values in the order of `symbolic.contact.worst_cases.CASE_SIZES`.
         load: (6,) force and moment on the hands about the box frame, box axes [N, N m].
-        directions: (n, 3) unit vectors along which the arms work against each other, box frame.
+        directions: (n, 3) unit vectors of the force of the second arm on the payload, box frame.
     """
     pads, robots = workcell.pads, workcell.pad_robots
     hands = HoldingHands(workcell).sharing(ca.DM(case[:2]))

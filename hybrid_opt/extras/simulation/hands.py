@@ -219,14 +219,15 @@ class HandSimulation:
 
 
 def own_forces(workcell: Workcell, forces: Array) -> Array:
-    """Scale needed holding forces from the weaker hands of a cell to each robot's own hands.
+    """Convert the holding forces of a contact model to those of each robot's own hands.
 
-    The contact model states the forces of both robots for hands with the lesser of both holding
-    forces. Each is multiplied by the robot's own holding force over the lesser one.
+    The contact model assumes equal hands for both robots, with the lesser one of the two holding
+    forces. The force of a robot is multiplied by the ratio of its own holding force to the lesser
+    one.
 
     Args:
         workcell: the cell.
-        forces: (2,) force for each robot, stated for the weaker hands [N].
+        forces: (2,) force for each robot by the contact model [N].
 
     Returns:
         (2,) holding force of each robot's own hands [N].
@@ -314,8 +315,9 @@ class HeldInHands:
         return slip, lift, float(turn)
 
     def wrenches(self, model: Any) -> Array:
-        """Measure the wrench (hands, 6) of each hand on the payload, about the hand's origin along
-        its axes: force, the normal part without the holding force [N], and moment [N m].
+        """Measure the wrench (hands, 6) of each hand on the payload: force [N] and moment [N m]
+        about the hand's origin, along its axes. The normal force does not include the holding
+        force.
 
         Args:
             model: MuJoCo's model of the scene, with the rest positions of the springs after the

@@ -310,11 +310,12 @@ def _counts(workcell: Workcell) -> list[int]:
 
 
 def _with_rest(values: Array, keep: float) -> Array:
-    """Insert two rows for a time at rest before an array. Each is the first row times a factor.
+    """Insert a time at rest before an array of samples: two rows, each the first row times a
+    factor.
 
     Args:
         values: (n, ...) the array.
-        keep: the factor: 1 for positions, 0 for rates per time.
+        keep: the factor: 1 for positions, which stay, and 0 for their derivatives.
 
     Returns:
         (n + 2, ...) array.

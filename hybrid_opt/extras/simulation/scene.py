@@ -502,8 +502,9 @@ def cell_text(workcell: Workcell, settings: ArmSettings) -> str:
     """Return the MJCF document of a whole cell, for `compiled`.
 
     Joints in the document are named `joint_ROBOT_NUMBER`, sites of the pads `pad_1` and `pad_2`,
-    the box `box`. A joint that moves both arms, and its link, occur in both arms and are tied
-    together. The effort of either arm contains the whole weight of the link.
+    the box `box`. A joint that moves both arms occurs in the document once per arm, with its link;
+    a constraint keeps both copies equal. The effort of each copy includes the whole weight of the
+    link.
 
     Args:
         workcell: the cell.
