@@ -123,7 +123,7 @@ class SmoothCell:
         self, evaluator: CandidateEvaluator, functions: PolishFunctions, clearance: float
     ) -> None:
         """Derive from a cell's task the half ranges and centre of the variables, the grid of points
-        and the blocks of samples.
+        along the path and the blocks of samples that one function call serves.
 
         Args:
             evaluator: evaluator of candidates by the full model.
@@ -131,7 +131,8 @@ class SmoothCell:
             clearance: distance that bodies keep beyond the collision tolerance [m].
 
         Raises:
-            SettingsError: robust forces are to be minimised, but do not exist for the cell's pads.
+            SettingsError: the objectives are robust normal forces, which hold the box in every case
+                of the uncertainty, but the cell's pads or uncertainty do not admit them.
         """
         self.evaluator, self.functions, self.clearance = evaluator, functions, clearance
         self.workcell, self.task = evaluator.workcell, evaluator.workcell.task
@@ -169,14 +170,14 @@ class SmoothCell:
     def waypoints(self, x: Array) -> Array:
         """Return the waypoints of a decision vector.
 
-        They equal those of `extended_waypoints`, which is called only if an angle changes by more
-        than pi between two waypoints; otherwise this method is faster.
+        The result is that of `extended_waypoints`. It is computed faster here unless an angle
+        changes by more than pi between two waypoints.
 
         Args:
             x: (n_var,) decision vector.
 
         Returns:
-            (n_waypoints, 6 + m) box poses [m, rad] followed by m redundant joints.
+            (n_waypoints, 6 + m) box poses [m, rad] followed by m redundant joints [rad or m].
         """
         points = self._fixed.copy()
         points[self.free] = x[: self._n_path]

@@ -106,8 +106,8 @@ def is_polishable(workcell: Workcell, robust: bool) -> bool:
 
     Args:
         workcell: the cell.
-        robust: True if the force limit applies to robust forces, for which both pads have to face
-            each other.
+        robust: True if the force limit applies to robust normal forces, which hold the box in every
+            case of the uncertainty. Their polish needs two pads that face each other.
     """
     return command_model(workcell).has_scalar_squeeze or not robust
 
@@ -115,8 +115,9 @@ def is_polishable(workcell: Workcell, robust: bool) -> bool:
 def force_range(driver: CandidateDriver) -> tuple[float, float]:
     """Return the least and the largest force limit of the task [N].
 
-    If the limit applies to robust forces, the least limit is raised, where necessary, to the force
-    that holds the box at rest at both ends of the path.
+    If the limit applies to robust normal forces, which hold the box in every case of the
+    uncertainty, the least limit is at least the robust force of the box at rest at both ends of the
+    path.
     """
     workcell = driver.timer.workcell
     least, most = workcell.task.force_limit
@@ -217,7 +218,8 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
                 intermediate waypoints too.
 
         Raises:
-            SettingsError: the cell is not drivable, or its robust forces have no closed form.
+            SettingsError: the cell is not drivable, or its force limit applies to robust normal
+                forces and its pads do not face each other.
         """
         driver, task = cell.evaluator.driver, cell.task
         if driver is None or not is_polishable(cell.workcell, driver.robust):
@@ -276,13 +278,18 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
     def evaluate_step(self, best: DriveIterate, step: DriveStep) -> StepEvaluation[DriveIterate]:
         """Evaluate a step by the fastest timing of the path to which it leads.
 
-        Shorter fractions of the step are tried until the duration falls by at least the share
-        `LEAST_REDUCTION_RATIO` of the prediction. If the prediction is smaller than the timing's
-        rounding, a step without a gain is also accepted, as long as such losses do not accumulate.
+        Shorter and shorter fractions of the step are tried until the duration falls by at least
+        `LEAST_REDUCTION_RATIO` of the reduction that the quadratic model predicts. If the predicted
+        reduction is within the rounding of the timing, a duration equal to the shortest one so far
+        suffices; so rounding errors do not accumulate over several steps.
 
         Args:
             best: the best iterate so far, from which the step starts.
             step: the step.
+
+        Returns:
+            The evaluation of the accepted fraction. It has no trial if no fraction is accepted, or
+            if a path on the way has no timing.
         """
         tiny = step.gain <= TIMING_NOISE
         for fraction in DRIVE_BACKTRACKING:
@@ -397,10 +404,11 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
         found: _StepAnswer | None = None,
         bent: Array | float = 0.0,
     ) -> _StepAnswer | None:
-        """Solve the quadratic program of a step, and solve it again with the timing rows that the
-        solution violates.
+        """Solve the quadratic program of a step repeatedly: each time add the timing rows that the
+        last solution violates, until none is violated or `ROW_ROUNDS` programs were solved.
 
-        A timing row is one limit at one point of the timing. Rows are added until none is violated.
+        A timing row is one limit at one point of the timing. If no step satisfies all rows, rows
+        that are violated at the iterate may stay violated as much as there.
 
         Args:
             program: path and timing about the iterate, linearised.

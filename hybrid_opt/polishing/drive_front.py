@@ -120,8 +120,8 @@ class DriveRun(PolishRun[DriveAttempt]):
         on_progress: Callable[[int, int], None],
         paths: Array,
     ) -> None:
-        """Find the least force limit with which any known path can hold the box at rest; the front
-        starts there.
+        """Prepare the polish of a front, and find the force limit at which the front starts: the
+        least one with which some known path can hold the box at rest.
 
         Known paths are those of the archive, the hand-made one and `paths`.
 
@@ -193,10 +193,10 @@ class DriveRun(PolishRun[DriveAttempt]):
         yield from self._gaps()
 
     def _attempt(self, path: Array, force: float, moves: Literal["stated", "all"]) -> DriveAttempt:
-        """Return the attempt that starts from a path.
+        """Build an attempt to reduce the duration of a path within a force limit.
 
         Args:
-            path: (n_path,) free waypoints.
+            path: (n_path,) free waypoints at which the solve starts.
             force: force limit [N].
             moves: which waypoints the solve moves, see `DriveAttempt`.
         """
@@ -204,12 +204,12 @@ class DriveRun(PolishRun[DriveAttempt]):
         return DriveAttempt("gap", -1, x, self._evaluator.evaluate(x).objectives[0], moves)
 
     def _rotated(self, force: float) -> list[Array]:
-        """Return paths (n_path,) from which solves start with another tilt of the box at the
-        waypoints of the workcell file.
+        """Return further paths (n_path,) from which solves start, with the box tilted otherwise at
+        the waypoints of the workcell file.
 
-        They are the fastest known path and the hand-made one, each with the box rotated in both
-        directions about every axis. For pads whose pressure may shift within the patches, the tilt
-        decides in which basin a solve ends.
+        Each is the fastest known path or the hand-made one, with the box rotated about one axis in
+        one direction. For pads whose pressure may shift within the patches, the tilt decides in
+        which local optimum a solve ends.
 
         Args:
             force: force limit [N]; paths without a timing within it are left out.
@@ -266,8 +266,10 @@ class DriveRun(PolishRun[DriveAttempt]):
             yield from self._fastest(np.vstack([between, self._others]), gap.force)
 
     def _fastest(self, paths: Array, force: float) -> Iterator[DriveAttempt]:
-        """Yield attempts that evaluate paths at a force limit unchanged, the fastest first, until
-        one is accepted.
+        """Yield attempts that evaluate paths at a force limit without moving their waypoints.
+
+        The fastest path comes first. At most `MOST_PATHS_TRIED` paths are tried, until one is
+        accepted or a known point dominates the next one.
 
         Args:
             paths: (n, n_path) free waypoints.

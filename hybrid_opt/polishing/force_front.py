@@ -179,7 +179,7 @@ def refinement_attempt(archive: ParetoArchive, objective: int | None) -> ForceAt
 
 
 def probe_attempt(start: Start, objective: int | None) -> ForceAttempt:
-    """Return a short solve towards an end of the front.
+    """Return an attempt with a short solve towards an end of the front or its balanced middle.
 
     Args:
         start: feasible candidate from which the solve starts.
@@ -190,8 +190,7 @@ def probe_attempt(start: Start, objective: int | None) -> ForceAttempt:
 
 
 def better_half(reached: list[Start], objective: int | None) -> list[Start]:
-    """Return the better half of some candidates, the best first; none if there is only one
-    candidate.
+    """Return the better half of some candidates, rounded down, the best first.
 
     Args:
         reached: the candidates.
@@ -254,22 +253,24 @@ def gap_attempt(
     stride: float = STRIDE,
     far: float = FAR_GAP,
 ) -> GapAttempt | None:
-    """Return an attempt to find a point in the widest gap of the front, from an end of the gap at
-    which no attempt started yet.
+    """Return an attempt to add a point to the widest gap of the front that is not given up yet.
 
-    If solves from both ends failed, because the front jumps there, and the gap is wider than `far`,
-    the attempt aims at the gap's middle with a large radius.
+    An attempt starts at an end of the gap and aims at a point a small distance away. Each end is
+    tried once. If both ends were tried and the gap is still wider than `far`, the front may jump
+    there; then attempts from both ends aim at the gap's middle, with a large radius. After that the
+    gap is given up.
 
     Args:
         archive: the points of the front and other known points.
-        tried: ends of gaps at which attempts started.
+        tried: starts of earlier attempts: decision vectors of the start and of the gap's other end,
+            as bytes, and True for a small distance.
         solved: number of points with which the front is complete.
         stride: largest distance along the front from the start to the point that is aimed at
             [front's extent].
         far: width of a gap above which the large radius is tried [front's extent].
 
     Returns:
-        The attempt; None if the front is complete, or all ends of gaps were tried.
+        The attempt; None if the front is complete, or all gaps are given up.
     """
     found = gaps(archive)
     if len(found) + 1 >= solved:
@@ -297,7 +298,8 @@ def gap_attempt(
 def made_little_progress(
     archive: ParetoArchive, gap_attempt: GapAttempt, objectives: Array
 ) -> bool:
-    """Return True if an attempt's result lies hardly farther along the front than its start.
+    """Return True if the result of an attempt to fill a gap lies less than the share
+    `LITTLE_PROGRESS` of the wanted distance away from its start.
 
     Args:
         archive: the front so far.
@@ -318,13 +320,13 @@ def _target(archive: ParetoArchive, k: int, step: float) -> Scalarisation:
 
 
 def widest_untried_gap(archive: ParetoArchive, tried: Collection[Chord]) -> ForceGap | None:
-    """Return the widest untried gap between neighbouring points of the front that the polish made.
+    """Return the widest gap between two polished neighbours on the front that was not tried yet.
 
     `ForceGap.width` measures gaps in the space of objectives.
 
     Args:
         archive: the front so far.
-        tried: pairs of decision vectors on both sides of the gaps that were tried.
+        tried: gaps that were tried, as `chord_across` returns them.
 
     Returns:
         The gap, or None if all were tried.
@@ -337,18 +339,26 @@ def widest_untried_gap(archive: ParetoArchive, tried: Collection[Chord]) -> Forc
 
 
 def chord_across(archive: ParetoArchive, gap: ForceGap) -> Chord:
-    """Return the decision vectors on both sides of a gap, as bytes."""
+    """Return the decision vectors on both sides of a gap as bytes, by which a tried gap is
+    recognised.
+    """
     return archive.x[gap.first].tobytes(), archive.x[gap.second].tobytes()
 
 
 def best_on_chord(
     evaluator: CandidateEvaluator, archive: ParetoArchive, gap: ForceGap
 ) -> tuple[Array, Array] | None:
-    """Evaluate points on the line between the decision vectors of a gap's two neighbours.
+    """Evaluate points on the straight line between the decision vectors of a gap's two neighbours.
+
+    Args:
+        evaluator: evaluator of candidates by the full model.
+        archive: the front so far.
+        gap: the gap.
 
     Returns:
         Decision vector (n_var,) and objectives (2,) of the feasible point that dominates the
-        largest area of the gap; None if all points are dominated or infeasible.
+        largest area of the gap in the space of objectives; None if all points are dominated or
+        infeasible.
     """
     share = np.arange(1, CHORD + 1)[:, None] / (CHORD + 1)
     x = (1.0 - share) * archive.x[gap.first] + share * archive.x[gap.second]

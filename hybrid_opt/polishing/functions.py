@@ -102,12 +102,15 @@ class PolishFunctions:
 
 
 def sample_quantities(workcell: Workcell) -> tuple[Quantity, ...]:
-    """Return what the polish of a cell evaluates at the samples of a carry, by name.
+    """Return the names of the quantities that the polish of a cell evaluates at the samples of a
+    carry.
 
-    The names are 'force' (normal forces) and, if it is limited, 'pressure' (shift of the centre of
-    pressure). Pads whose forces have no closed form have 'load' instead: the force and moment that
-    the box needs, from which a convex program computes the forces. Drivable cells have none,
-    because their limits apply at the intervals of the timing.
+    - 'force': normal forces.
+    - 'pressure': shift of the centre of pressure, if it is limited.
+    - 'load': force and moment that the box needs. Pads whose forces have no closed form have it in
+      place of the others; a convex program computes their forces from it.
+
+    Drivable cells have none, because their limits apply at the intervals of the timing.
 
     Args:
         workcell: the cell.
@@ -178,7 +181,7 @@ def _held(model: CellModel) -> dict[str, ca.Function]:
 
 
 def _driven_held(model: CellModel) -> dict[str, ca.Function]:
-    """Build the functions that compute the pads' forces by a convex program.
+    """Build the functions that compute the forces of pads without closed form by a convex program.
 
     The weight of the program's logarithmic barrier is that of the timing, so that polish and timing
     compute equal forces.

@@ -60,12 +60,13 @@ class PointInequalities:
     def from_workcell(cls, workcell: Workcell, robust: int = 0) -> PointInequalities:
         """Return the inequalities of a workcell.
 
-        A quantity that is limited in both signs has two inequalities. A normal force has one per
-        branch, the linear functions whose maximum it is.
+        A quantity that is limited in both signs has two inequalities. A planned normal force has
+        one per branch, the linear functions whose maximum it is.
 
         Args:
             workcell: the cell.
-            robust: number of robust forces at a point, each with one inequality.
+            robust: number of robust normal forces at a point: forces of either arm in chosen cases
+                of the uncertainty, each with one inequality; 0 if planned forces are limited.
         """
         layout = driven_layout(workcell)
         eye = np.eye(layout.size)
@@ -243,8 +244,8 @@ class IntervalValues:
         self.value, self.slope = value, slope
 
     def at_rest(self, force: float) -> tuple[Array, Array]:
-        """Compute the ratio of value to limit for each contact while the box is at rest, at the
-        beginning of every interval of the timing.
+        """Compute how far the limit of each contact is used if the box rests at the beginning of
+        each interval of the timing.
 
         The limited quantity is the pressure shift or, for pads without a limit on pressure, the
         normal force.
@@ -253,8 +254,9 @@ class IntervalValues:
             force: the force limit [N].
 
         Returns:
-            Ratios (2 intervals,), and their derivatives (2 intervals, moving) by the box pose with
-            redundant joints and by its first and second derivative by u.
+            - Ratios (2 intervals,) of value to limit, both contacts of the first interval first.
+            - Derivatives (2 intervals, 3 (6 + m)) of the ratios by the box pose with m redundant
+              joints, and by its first and second derivative by u.
         """
         begins = [values[::2] for values in self._inputs]
         still, grid = np.zeros(len(begins[-1])), self._grid
@@ -278,7 +280,8 @@ class IntervalValues:
         """Compute the Hessian of the weighted sum of all limited quantities at each point.
 
         Args:
-            weight: (points, quantities) weights. Robust forces get the curvature of planned ones.
+            weight: (points, quantities) weights. In place of the curvature of robust normal forces,
+                which is not computed, that of planned ones is taken.
 
         Returns:
             Indices (m,) of the points with a nonzero weight, and their Hessians (m, moving + 2,
@@ -475,8 +478,9 @@ class PathTimingProgram:
         self._speeds(squared)
 
     def _still(self, values: IntervalValues) -> None:
-        """Add inequalities on the forces or the pressure of the box at rest to the program's
-        geometric rows. Their curvature is small and neglected.
+        """Append inequalities to the program's geometric rows: the box can be held at rest at the
+        beginning of every interval, as far as a force or pressure is near its limit there. Their
+        curvature is small and neglected.
 
         Args:
             values: limited quantities of the iterate.
@@ -489,8 +493,8 @@ class PathTimingProgram:
         self._geometry_slope = np.concatenate([self._geometry_slope, by_path])
 
     def _speeds(self, w: Array) -> None:
-        """Store the duration with its derivatives by omega, the relative changes of the iterate's
-        squared speeds, and the derivatives by omega of u'' and u'^2 at each point.
+        """Store value, gradient and Hessian of the duration by omega, the relative changes of the
+        iterate's squared speeds; and the derivatives by omega of u'' and u'^2 at each point.
 
         Args:
             w: (intervals + 1,) squared path speeds u'^2 of the iterate [1/s^2].

@@ -116,12 +116,15 @@ class TrustRegion:
     ) -> None:
         """Update the radius after an accepted step.
 
+        The radius doubles if the trust region limited the step and the model is good: the reduction
+        ratio is above `HIGH_RATIO` or, without a ratio, no step was rejected since the last
+        accepted one. It halves if the ratio is at most `LOW_RATIO`.
+
         Args:
             length: largest change of a scaled variable in the step.
-            reduction_ratio: actual over predicted reduction; None without a prediction. The radius
-                then grows after two accepted steps in a row.
+            reduction_ratio: actual over predicted reduction; None without a prediction.
             is_partial: True if only a fraction of the step was accepted; `length` is that of the
-                fraction, and becomes the radius.
+                fraction, and becomes the radius first.
         """
         if is_partial:
             self.radius = length
@@ -428,7 +431,9 @@ class TrustRegionSolve(Generic[AnyIterate, AnyStep]):
 
     @property
     def is_finished(self) -> bool:
-        """True if further iterations would change nothing."""
+        """True if the best iterate is stationary, the trust region is exhausted, or the start could
+        not be evaluated: further iterations would change nothing.
+        """
         return self.solution.converged or self._region.is_exhausted or not self.solution.usable
 
     def run(self, rounds: int, least_gain: float = 0.0) -> Solution:

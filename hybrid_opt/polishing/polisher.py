@@ -33,7 +33,8 @@ TIMED_EVALUATIONS = 32
 def has_polishable_forces(workcell: Workcell, objectives: Sequence[str]) -> bool:
     """Return True if the polish supports the forces among the objectives.
 
-    It supports planned forces of all pads, and robust forces of two pads with opposite normals.
+    It supports planned normal forces of all pads. Robust normal forces, which hold the box in every
+    case of the uncertainty, need two pads with opposite normals.
 
     Args:
         workcell: the cell.

@@ -45,8 +45,8 @@ class RobustSamples:
             workcell: the cell.
 
         Raises:
-            SettingsError: the pads have no robust forces, or the uncertainty leaves no friction or
-                patch.
+            SettingsError: no force of the pads holds the box in some case of the uncertainty, or
+                the uncertainty leaves no friction or patch.
             DualArmError: a function cannot be built.
         """
         self._workcell, self._model = workcell, robust_model(workcell)
@@ -55,7 +55,8 @@ class RobustSamples:
         self._motion = interpret(motion_function(workcell.task))
 
     def forces(self, found: Mapping[str, Array]) -> Array:
-        """Compute the robust forces (n, 2) [N] of both robots at n samples.
+        """Compute the normal forces (n, 2) [N] with which both robots hold the box in every case of
+        the uncertainty, at n samples.
 
         Args:
             found: the evaluator's outputs for one candidate, of which the box pose and its first
@@ -65,7 +66,8 @@ class RobustSamples:
         return self._governing(motion).force
 
     def first(self, x: Array) -> tuple[Array, Array]:
-        """Compute the robust forces of a decision vector, and their first derivatives.
+        """Compute the normal forces with which both robots hold the box in every case of the
+        uncertainty, and their first derivatives by the decision vector.
 
         Args:
             x: (n_var,) decision vector.
@@ -106,8 +108,8 @@ class RobustForces:
         self._branches = planned_branches(workcell)
 
     def at(self, path: Sequence[Array], a: Array, w: Array) -> tuple[Array, Array]:
-        """Compute the robust forces in the most demanding cases of the uncertainty, and their
-        derivatives.
+        """Compute the normal forces that hold the box in the `GOVERNING_CASES` cases of the
+        uncertainty with the largest commanded forces at each point, and their derivatives.
 
         Args:
             path: box pose followed by redundant joints, and its first and second derivative by the
@@ -116,8 +118,9 @@ class RobustForces:
             w: (points,) squared path speed u'^2 [1/s^2].
 
         Returns:
-            Forces (points, ROBUST_ROWS) [N], and their derivatives (points, ROBUST_ROWS, 3 pose +
-            2) by the entries of `path`, u'' and u'^2.
+            Forces (points, ROBUST_ROWS) [N], all cases of the first robot and then those of the
+            second; and their derivatives (points, ROBUST_ROWS, 3 pose + 2) by the entries of
+            `path`, u'' and u'^2.
         """
         pose, first, second = (np.ascontiguousarray(part[:, :6]) for part in path)
         force, slope = self._forces.most_demanding(
@@ -132,10 +135,10 @@ class RobustForces:
         return force.reshape(n, ROBUST_ROWS), found
 
     def planned_weights(self, weight: Array, value: Array) -> Array:
-        """Replace the multipliers of robust forces by multipliers of planned forces.
+        """Replace the multipliers of robust normal forces by multipliers of planned normal forces.
 
-        The Hessian of a Lagrangian with these multipliers has the curvature of planned forces in
-        place of the curvature of robust forces.
+        A Hessian of the Lagrangian with the new multipliers approximates the curvature of robust
+        forces, which is not computed, by that of planned forces.
 
         Args:
             weight: (points, quantities + ROBUST_ROWS) multipliers of the quantities, then of the

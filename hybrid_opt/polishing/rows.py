@@ -176,8 +176,8 @@ class _SampleRows:
 
 
 def _all_directions(second: NumericFunction, n: int, n_var: int) -> PreparedBatch:
-    """Prepare a call of a function that computes second derivatives at n samples, one direction of
-    x at a time, for all directions.
+    """Prepare a call that computes second derivatives at n samples: a function of one direction of
+    x is evaluated for all `n_var` directions.
 
     Args:
         second: function that evaluates second derivatives along one direction.
@@ -413,8 +413,9 @@ class ConstraintRows:
 
     @property
     def forces(self) -> Array:
-        """The two quantities (n_forces, 2) [N] from which normal forces follow, for each force row
-        and at the last evaluated x.
+        """The two force quantities (n_forces, 2) [N] of each force row, at the last evaluated x.
+        They are the normal and the tangential part of the required force or, if a convex program
+        computes the forces, both normal forces.
         """
         return self._forces.found[self._column]
 

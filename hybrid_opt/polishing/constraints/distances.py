@@ -284,8 +284,8 @@ def edges(gaps: Gaps, limit: float) -> list[tuple[int, int]]:
         limit: kinks are left out if the largest gap reaches this limit [m] at both points.
 
     Returns:
-        For each kink the index of the point before it, and the index of that one of these two
-        points with the smaller value of the largest gap.
+        Two indices for each kink: that of the point before it, and that of the point, before or
+        after it, at which the largest gap is smaller.
     """
     best, height, along = gaps.best, gaps.height, gaps.along
     return [
@@ -351,9 +351,10 @@ def violated_passages(
         known: candidate before the step.
 
     Yields:
-        Index of the pair; its gaps before the step; index of a point with a local minimum of the
-        distance below its limit; and the kinks (index of the point before the kink, index of the
-        point with the smaller gap) that lie near this point, before the step.
+        - Index of the pair.
+        - Gaps of the pair before the step.
+        - Index of a point at which the distance has a local minimum below its limit.
+        - Kinks within `KINK_WINDOW` of this point before the step, as `edges` returns them.
     """
     window = kind.grid.points(KINK_WINDOW)
     for pair, distance in carry.distances.closer_than(kind.least).items():

@@ -115,11 +115,11 @@ class Forces(ConstraintKind[ForceRow]):
         yield from self._other_branches(carry)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[ForceRow]:
-        """Return rows (scalar inequalities) for the branches that determine a normal force, or
-        nearly do, and have no rows along the whole path.
+        """Return rows (scalar inequalities) for the branches that determine a normal force after a
+        step, or nearly do, and that the program may lack.
 
-        A normal force is the maximum of several linear functions, its branches. Only the branch
-        with tight friction cones has rows along the whole path.
+        A normal force is the maximum of several linear functions, its branches. The branch with
+        tight friction cones is left out, because it has rows along the whole path anyway.
 
         Args:
             carry: candidate after the step.
@@ -157,8 +157,9 @@ class Forces(ConstraintKind[ForceRow]):
         return np.asarray(np.einsum("rbk,nk->nrb", self.cell.coefficients, carry.split))
 
     def _peaks(self, carry: PlacedCarry) -> set[int]:
-        """Return the indices of the samples at which a robot's normal force has a high local
-        maximum, and of the samples before and after each of them.
+        """Return the indices of the samples at which a robot's normal force has a local maximum of
+        at least `PEAK_SHARE` of its largest value, and of the samples before and after each of
+        them.
         """
         has_branches = self.cell.robust is None and self._main == CONE_TIGHT
         force = self._values(carry).max(axis=2) if has_branches else carry.force
