@@ -145,8 +145,9 @@ class Sensitivity:
 
     @property
     def change(self) -> float:
-        """Change of the number by which effects are compared, chosen by its unit: 0.001 m, 0.1 kg,
-        1 N and so on [unit]."""
+        """Usual change of a number with this unit: 0.001 m, 0.1 kg, 1 N and so on [unit]. Effects
+        of numbers with different units are compared by it.
+        """
         return float(USUAL_CHANGES[self.unit])
 
 
@@ -222,12 +223,15 @@ class _Number:
 
 
 def sensitivities(carry: Carry | Timing, *, progress: ShowProgress = False) -> Sensitivities:
-    """Compute the derivatives of a carry's force and duration with respect to all numbers of its
-    workcell file.
+    """Compute the derivatives of a carry's largest commanded force and duration with respect to all
+    numbers of its workcell file.
 
-    For a carry under a time law, the motion follows the law in the changed cell. For a timing, the
-    duration is the duration of the fastest timing of the path within the same limits in the changed
-    cell. The force is the force of the motion with unchanged path speeds.
+    How the motion changes with a number depends on what is given:
+
+    - A carry under a time law follows the law in the changed cell.
+    - For the fastest timing of a path, the derivative of the duration is that of the fastest timing
+      of the same path in the changed cell. The derivative of the force is that with unchanged path
+      speeds.
 
     Args:
         carry: a carry under the time law of its task, or the fastest timing of a path within
@@ -236,8 +240,9 @@ def sensitivities(carry: Carry | Timing, *, progress: ShowProgress = False) -> S
             numbers done and their total.
 
     Raises:
-        SettingsError: the carry has another timing, the timing limits robust forces or is not the
-            fastest, or no force holds the box in every case of the uncertainty.
+        SettingsError: the carry has another timing; or the given timing is not the fastest, or
+            limits robust normal forces (which hold the box in every case of the uncertainty)
+            instead of planned ones; or no force holds the box in every case.
     """
     drive = _Law(carry) if isinstance(carry, Carry) else _Fastest(carry)
     workcell, ruling = drive.carry.workcell, GoverningForce(drive.carry, LEADER)

@@ -103,7 +103,7 @@ _load_of = lru_cache(maxsize=CACHED_WORKCELLS)(uncertain_load_function)
 def still_load(
     workcell: Workcell, pose: Array, friction: float = 1.0, function: ca.Function | None = None
 ) -> dict[str, Array]:
-    """Compute the contact forces and moments of the payload at rest in one pose.
+    """Compute the contact forces and moments that hold the payload at rest in one pose.
 
     Args:
         workcell: the description of the cell.
@@ -311,10 +311,9 @@ class _Still:
             yield StaticUtilisation(TORQUE, whose, where, float(torque[joint]), float(most), unit)
 
     def remedy(self, exceeded: list[StaticUtilisation]) -> str:
-        """Return a text with the largest payload mass, the least friction and the least patch
-        radius with which no given limit is exceeded.
-
-        Mass and friction are alternatives, each with everything else unchanged.
+        """Return a text on what would bring all given limits into reach: a smaller payload mass or
+        more friction, each with everything else unchanged, and for pressure shifts a larger patch
+        radius.
 
         Args:
             exceeded: the limits that the present cell exceeds.
@@ -361,11 +360,11 @@ class _Still:
 
 def _nearest(enough: Callable[[float], bool], here: float, far: float) -> float | None:
     """Find by bisection the factor nearest to `here`, between `here` and `far`, at which a
-    condition holds.
+    condition holds. The condition may change once in between.
 
     Args:
         enough: function that returns True if the condition holds at a factor.
-        here, far: ends of the searched interval.
+        here, far: ends of the searched interval, in either order.
 
     Returns:
         The factor; None if the condition does not hold at `far`.

@@ -70,9 +70,10 @@ class Polisher:
             functions: compiled functions of the cell; None loads or builds them.
 
         Raises:
-            SettingsError: the polish does not support the evaluator's objectives (it needs both
-                peak forces, planned or robust; in drivable cells duration and one of these), or it
-                does not support the cell's pads.
+            SettingsError: the polish does not support the evaluator's objectives, or the cell's
+                pads. It needs both peak normal forces as objectives, in drivable cells the duration
+                and one of them. The forces may be planned or robust (holding the box in every case
+                of the uncertainty).
             DualArmError: the functions cannot be built.
         """
         self.evaluator, self.settings = evaluator, settings

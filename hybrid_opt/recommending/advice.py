@@ -162,12 +162,11 @@ def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tu
         slope = float((durations[high] - durations[low]) / (forces[high] - forces[low]))
 
     def in_time(force: float) -> float:
-        """Return the change of the duration [s] that is worth as much as a change of the commanded
-        force.
+        """Convert a change of the commanded force at an unchanged duration to the change of the
+        duration at an unchanged commanded force [s].
 
         Args:
-            force: change of the commanded force at an unchanged duration [N]. The result is the
-                change of the duration at an unchanged commanded force.
+            force: change of the commanded force [N].
         """
         spare = float(np.interp(option.commanded - force, forces, durations))
         lost = max(forces[0] - (option.commanded - force), 0.0)
@@ -302,7 +301,8 @@ def _of_pitch(cell: Cell, path: Array, option: Option, slope: float) -> Iterator
         cell: the drivable cell.
         path: (n_path,) decision vector of the carry without its force limit.
         option: timing of this path within a force limit.
-        slope: change of the duration per newton of commanded force [s/N].
+        slope: change of the path's shortest duration per newton of commanded force, negative [s/N];
+            0 if it is not known, for which nothing is yielded.
     """
     if slope == 0.0:
         return

@@ -320,8 +320,9 @@ class DrivenPaths:
         """Compute timings of every path: one within the path's own force limit, and one within each
         of `FORCES` further limits.
 
-        The further limits lie between the force at rest, plus a small margin, and `highest_force`.
-        If force limits apply to robust forces, there are no further limits.
+        The further limits of a path lie between slightly more than the force that holds the box at
+        rest and `highest_force`. There are none if force limits apply to robust normal forces,
+        which hold the box in every case of the uncertainty.
 
         Args:
             own: force limit with which each path was found [N]: one per path (k,), or one for all

@@ -186,8 +186,9 @@ def recommend(
     """Recommend the carry of a drivable front to run.
 
     By default the carry with the least product of duration and commanded force is recommended.
-    Carries with robust forces above the reference forces are excluded. If all exceed them, none is
-    excluded, and `Recommendation.objection` states the necessary changes of the cell.
+    Carries are excluded if a robot needs more than its reference force to hold the box in every
+    case of the uncertainty. If all do, none is excluded, and `Recommendation.objection` states the
+    necessary changes of the cell.
 
     Args:
         front: front of a drivable cell, see `Cell.drivable`.
@@ -301,8 +302,10 @@ def _require_members(cell: Cell, front: Front) -> None:
 def _driven(
     cell: Cell, paths: DrivenPaths, options: Sequence[Option], goal: Goal, wished: bool
 ) -> tuple[Option, Timing, bool]:
-    """Choose the carry to recommend. The best paths are timed again without jumps of acceleration,
-    because robots drive such a timing.
+    """Choose the carry to recommend, by timings that robots can drive.
+
+    The options' timings have jumps of acceleration. The best paths are timed again without them. If
+    a path then exceeds a limit of the goal, shorter or gentler options of the same path are tried.
 
     Args:
         cell: drivable cell.
@@ -543,10 +546,10 @@ def level_force(workcell: Workcell, kind: ForceKind) -> float:
 
 
 def table_forces(workcell: Workcell) -> Array:
-    """Return the commanded forces (n,) [N] for which a table states the shortest durations.
+    """Return commanded forces (n,) [N], for a table of the shortest duration with each of them.
 
-    They are multiples of the robust force that holds the payload level and at rest, followed by the
-    reference force of the force-controlled arm.
+    They are multiples of the force that holds the payload level and at rest in every case of the
+    uncertainty, followed by the reference force of the force-controlled arm.
 
     Raises:
         SettingsError: the uncertainty leaves no friction or contact patch.
@@ -557,10 +560,10 @@ def table_forces(workcell: Workcell) -> Array:
 
 
 def commanded_durations(paths: DrivenPaths, limits: Array | float, forces: Array) -> Array:
-    """Compute the shortest duration (n,) [s] of any of k paths within each of n limits on the
-    commanded force.
+    """Compute for each of n limits on the commanded force the duration (n,) [s] of the fastest of k
+    paths; infinite if no path has a timing within the limit.
 
-    Limits on jerk are ignored. The duration is infinite if no path has a timing within the limit.
+    Limits on jerk are ignored.
 
     Args:
         paths: the paths.

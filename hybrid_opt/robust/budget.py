@@ -191,12 +191,13 @@ def _ends_at_rest(workcell: Workcell) -> BoxMotion:
 def largest_forces(
     model: RobustModel, motion: HeldMotion, rows: NDArray[np.intp] | None = None
 ) -> Array:
-    """Compute the largest robust normal force (2,) of each robot over a motion [N].
+    """Compute the largest normal force (2,) [N] that each robot needs over a motion to hold the box
+    in every case of the uncertainty.
 
-    Each pose of the motion is held twice: with its time derivatives, and at rest.
+    Both the motion and a standstill in each of its poses count.
 
     Args:
-        model: computes robust forces of the workcell.
+        model: computes robust normal forces, which hold the box in every case of the uncertainty.
         motion: box poses and their time derivatives.
         rows: indices of the rows of `RobustModel.worst_cases` to consider; None for all.
 
@@ -224,10 +225,10 @@ def cheapest_remedies(
     them at a time.
 
     Args:
-        model: computes robust forces of the workcell.
+        model: computes robust normal forces, which hold the box in every case of the uncertainty.
         motion: samples of the motion at which the required forces are largest.
-        required: (2,) largest required normal force of each robot [N]; it may exceed the robust
-            force at the samples, for example because commanded forces are smoothed over time.
+        required: (2,) largest required normal force of each robot [N]. It may be larger than the
+            samples need, for example because commanded forces are smoothed over time.
         allowed: (2,) reference force of each robot [N].
         most: largest number of remedies.
 
@@ -283,15 +284,17 @@ def _last_factor(excess: Callable[[float], float], near: float, far: float) -> f
 def _excess(
     model: RobustModel, motion: HeldMotion, required: Array, allowed: Array
 ) -> Callable[[Workcell], float]:
-    """Return a function that tells by how much the required forces of a changed cell exceed the
+    """Return a function that computes by how much the required forces of a changed cell exceed the
     reference forces.
 
     The function takes the changed cell. It returns the largest ratio of a required force to its
     reference force, minus one: zero if the forces just fit. The required forces of the changed cell
-    are `required` times the ratio of its robust forces to those of the unchanged cell.
+    are estimated: `required` changes in proportion to the forces that hold the box in every case of
+    the uncertainty.
 
     Args:
-        model: computes robust forces of the unchanged cell.
+        model: computes robust normal forces of the unchanged cell, which hold the box in every case
+            of the uncertainty.
         motion: samples of the motion at which the required forces are largest.
         required: (2,) required normal force of each robot in the unchanged cell [N].
         allowed: (2,) reference force of each robot [N].

@@ -184,12 +184,12 @@ class GoverningCases:
 
 
 def transmitted_share(difference: Array, uncertainty: Uncertainty) -> Array:
-    """Compute the share of the difference between both arms' normal forces that acts on the
-    position-controlled arm, for the payload mass that loads this arm most.
+    """Compute the factor on a difference of both arms' normal forces, stated for the largest
+    payload mass, that gives it for the mass that loads the position-controlled arm most.
 
     The difference is proportional to the mass. Where it is positive, the largest mass loads the arm
-    most, and the share is 1. Where it is negative, the least mass does, and the share is (1 - s) /
-    (1 + s) with the relative uncertainty s of the mass.
+    most, and the factor is 1. Where it is negative, the least mass does, and the factor is (1 - s)
+    / (1 + s) with the relative uncertainty s of the mass.
 
     Args:
         difference: force of the position-controlled arm minus the commanded force of the other arm,
@@ -197,7 +197,7 @@ def transmitted_share(difference: Array, uncertainty: Uncertainty) -> Array:
         uncertainty: ranges of the uncertain quantities.
 
     Returns:
-        Share between 0 and 1, in the shape of `difference`.
+        Factor between 0 and 1, in the shape of `difference`.
     """
     lightest = (1.0 - uncertainty.mass) / (1.0 + uncertainty.mass)
     return np.where(difference > 0.0, 1.0, lightest)

@@ -139,7 +139,7 @@ class RobustModel:
     def __init__(
         self, workcell: Workcell, load: Callable[..., NumericFunction] = contact_function
     ) -> None:
-        """Load or build the compiled functions that compute robust forces.
+        """Load or build the compiled functions.
 
         They are loaded at once if the normal force of one pad determines that of the other pad,
         else on first use.
@@ -577,8 +577,8 @@ model."""
 
 
 def interpreted_robust_model(workcell: Workcell) -> RobustModel:
-    """Return a robust model whose functions CasADi interprets: nothing is compiled, which suits a
-    few samples.
+    """Return a `RobustModel` whose functions CasADi interprets. Nothing is compiled, so it is ready
+    sooner, but slower for many samples.
     """
     # Not imported at the top: what is compiled already needs no CasADi.
     from codegen.interpreted import interpret

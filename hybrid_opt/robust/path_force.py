@@ -136,7 +136,8 @@ class RobustPath:
     def governing_above(
         self, points: PathPoints, level: Array
     ) -> tuple[NDArray[np.intp], GoverningCases]:
-        """Find the points at which the robust normal force of either robot exceeds a level.
+        """Find the points at which a robot needs more than a given normal force to hold the box in
+        every case of the uncertainty.
 
         `RobustModel.slack` proves that most cases need less; only the forces of the remaining cases
         are computed. Call `slopes` with the result for the derivatives.
@@ -280,11 +281,12 @@ class GoverningForce:
         raised or lowered.
 
         Args:
-            low, high: cells in which the number is lower, and higher by the same amount, than in
-                this cell.
+            low, high: two cells in which the number is lower, and higher by the same amount, than
+                in this cell.
             motions: box motions in the cell `low` and in the cell `high`, at `samples`.
-            pads: True if the pads of `low` and `high` differ. Forces of pads without opposite
-                normals are then computed again.
+            pads: True if the pads of `low` and `high` differ. For pads without opposite normals the
+                forces are then computed in both cells, because the derivatives do not include the
+                pads.
 
         Returns:
             Changes of the force from this cell to `high`, and from this cell to `low`.
@@ -305,12 +307,12 @@ class GoverningForce:
         return self._inputs(self._workcell, self._motion, pads=True)
 
     def _inputs(self, cell: Workcell, motion: BoxMotion, pads: bool) -> Array:
-        """Compute the quantities on which the commanded force depends, for another cell.
+        """Compute the inputs of `_gradient` for another cell: the quantities on which the commanded
+        force depends in each of the k cases that need the largest force.
 
-        There is one row for each of the k cases that need the largest force. It contains the box
-        pose [m, rad], its first and second derivative by time, and the case of the uncertainty;
-        then, for pads with opposite normals, the cell's parameters, else the load on the box.
-        Entries have SI units.
+        A row contains the box pose, its first and second time derivative, and the case of the
+        uncertainty. For pads with opposite normals the cell's parameters follow, for other pads the
+        load on the box.
 
         Args:
             cell: the other cell.
@@ -318,9 +320,9 @@ class GoverningForce:
             pads: True if the other cell's pads differ from this cell's.
 
         Returns:
-            (k, m) quantities, in the order of the last axis of `_gradient`. If `pads` is True and
-            the pads' normals are not opposite, `_gradient` does not apply: the result then is the
-            normal force (k, 1) of the force-controlled arm [N].
+            (k, m) quantities in SI units, in the order of the last axis of `_gradient`. If `pads`
+            is True and the pads' normals are not opposite, `_gradient` does not apply: the result
+            then is the normal force (k, 1) of the force-controlled arm [N].
         """
         cases = worst_cases(command_model(cell), cell.uncertainty, self._leader)
         assert len(cases) == self._count, "no range of the uncertainty begins or ends"
@@ -339,12 +341,12 @@ class GoverningForce:
 
     @cached_property
     def _gradient(self) -> Array:
-        """Gradient (k, 2, m) of the commanded force by the m inputs of `_inputs`, in each of k
-        cases.
+        """Gradient (k, 2, m) of the commanded force by the m inputs of `_inputs`, in each of the k
+        cases that need the largest force.
 
-        These are the cases that need the largest force. The lower of both friction coefficients
-        decides how the arms share the force. So index 0 of the second axis has the gradient with
-        the coefficient of robot 0 slightly lowered, and index 1 with that of robot 1.
+        The second axis has two one-sided gradients: with the friction coefficient of robot 0
+        slightly lowered, and with that of robot 1. They differ if both coefficients are equal,
+        because the lower one decides how the arms share the force.
         """
         if self._squeezed:
             numbers = WorkcellParameters(self._workcell)

@@ -57,11 +57,11 @@ def robust_price(
     threads: int = 1,
     points: int = POINTS,
 ) -> RobustPrice:
-    """Compute the normal forces that hold the box of a carry in every case, for several sizes of
-    the uncertainty.
+    """Compute how the largest normal forces of a carry that hold the box in every case of the
+    uncertainty grow with the size of the uncertainty.
 
     Args:
-        model: computes robust forces of the carry's workcell.
+        model: computes robust normal forces, which hold the box in every case of the uncertainty.
         carry: the carry.
         rng: random generator for the cases of the check.
         leader: index of the position-controlled arm.

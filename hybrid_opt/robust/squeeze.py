@@ -155,10 +155,10 @@ def extra_normal_force(
     """Compute the force (n,) [N] that the force-controlled arm is to press in addition to its
     planned force.
 
-    The commanded force is smooth where the planned forces are smooth. Neither robot presses less
-    than planned, nor less than evenly pressing pads need in any case of the uncertainty, in motion
-    or at rest. The force of the position-controlled arm rises by
-    `ContactModel.internal_force_ratio` times the result.
+    By default the commanded force holds the box in every case of the uncertainty, in motion and at
+    rest. With `SqueezeSettings.factor` it is a multiple of the force that holds the box without
+    uncertainty. In both cases it is smooth over time and never below the planned force. The force
+    of the position-controlled arm rises by `ContactModel.internal_force_ratio` times the result.
 
     Args:
         workcell: the workcell.
@@ -207,11 +207,14 @@ def extra_normal_force(
 def _contributions(
     model: RobustModel, leader: int, motion: HeldMotion, planned: Array
 ) -> list[Contribution]:
-    """Compute by how much each source of uncertainty raises the largest robust force of the
-    force-controlled arm, when the sources are added one after the other.
+    """Divide the largest commanded force over a motion into the part that is needed without
+    uncertainty and one part per source of uncertainty.
+
+    The sources are added one after the other; the part of a source is the rise of the force when it
+    is added.
 
     Args:
-        model: computes robust forces of the workcell.
+        model: computes robust normal forces, which hold the box in every case of the uncertainty.
         leader: index of the position-controlled arm.
         motion: motion of the box at n samples.
         planned: (n,) planned normal force of the force-controlled arm [N].
@@ -239,11 +242,11 @@ def _in_every_case(
     motion: HeldMotion,
     planned: Array | float,
 ) -> Array:
-    """Compute the least force (n,) [N] of the force-controlled arm that holds the box in every case
-    of an uncertainty at each of n poses, with the motion's derivatives as well as at rest.
+    """Compute the least force (n,) [N] with which the force-controlled arm holds the box in every
+    case of an uncertainty, both in motion and at a standstill in each of n poses.
 
     Args:
-        model: computes robust forces of the workcell.
+        model: computes robust normal forces, which hold the box in every case of the uncertainty.
         uncertainty: ranges of the uncertain quantities.
         leader: index of the position-controlled arm.
         motion: motion of the box at n samples.
