@@ -1,9 +1,9 @@
 """First carries for the problems that ship, and what comes of them.
 
-Sixteen problems of two UR5, UR10, Panda, xArm7 or IRB 120, or of an RB-Y1: flat, over a wall, past
-a post, into and off a shelf, out of a bin, turned, pitched, turned over, a rod between poles or
-cones, from the ground onto a table. Each is proposed from nothing with every seed; with --recommend
-a drivable search, a polish and a recommendation follow, which compile.
+Seventeen problems of two UR5, UR10, Panda, xArm7, iiwa or IRB 120, or of an RB-Y1: flat, over a
+wall, past a post, into and off a shelf, out of a bin, turned, pitched, turned over, a rod between
+poles or cones, from the ground onto a table. Each is proposed from nothing with every seed; with
+--recommend a drivable search, a polish and a recommendation follow, which compile.
 """
 
 from __future__ import annotations
