@@ -403,7 +403,7 @@ def _cut_file(path: Path, scale: tuple[float, ...], state: tuple[int, int]) -> C
 def shape_pieces(
     shape: Shape | Capsule, pose: Array, owner: str, meshes: MeshReader
 ) -> tuple[Piece, ...]:
-    """Return the convex pieces of a shape.
+    """Return the convex pieces of a shape, in the frame of its body.
 
     Args:
         shape: the shape.

@@ -224,7 +224,8 @@ def hull_volume(triangles: Array) -> float:
 
 
 def _best_cut(triangles: Array) -> tuple[float, tuple[Array, ...]]:
-    """Find the plane across a coordinate axis that reduces the volume of the hulls most.
+    """Find the plane, perpendicular to a coordinate axis, at which a cut reduces the total volume
+    of the hulls most.
 
     Args:
         triangles: (n, 3, 3) corners of triangles [m].
@@ -246,11 +247,11 @@ def _best_cut(triangles: Array) -> tuple[float, tuple[Array, ...]]:
 
 
 def _clip(triangles: Array, axis: int, level: float, side: float) -> Array:
-    """Cut triangles (n, 3, 3) at a plane and return the triangles on one side.
+    """Cut triangles at a plane and return the triangles on one side, (m, 3, 3) [m].
 
     Args:
         triangles: (n, 3, 3) corners [m].
-        axis: index of the coordinate axis across which the plane lies.
+        axis: index of the coordinate axis to which the plane is perpendicular.
         level: coordinate of the plane [m].
         side: 1 for the side of larger coordinates, -1 for the other side.
     """

@@ -334,8 +334,8 @@ def _reach(body: CollisionBody, arms: tuple[ArmGeometry, ArmGeometry]) -> Reach:
 
 
 def reach_about_joints(body: CollisionBody, arm: ArmGeometry) -> Array:
-    """Compute for each joint of an arm an upper bound of the distance of a link's points from the
-    joint's axis [m].
+    """Compute for each joint of an arm how far a link's points move at most per unit of the joint's
+    motion: for a turning joint an upper bound of their distance from the joint's axis [m].
 
     For the link's own joint the bound follows from the shape. For earlier joints the chain of links
     in between is assumed stretched.
