@@ -99,7 +99,11 @@ def _as_tuple(value: Any) -> Any:
 
 
 def numpy_shape(rows: int, columns: int) -> Shape:
-    """Return the NumPy shape of a dense CasADi (rows, columns) matrix."""
+    """Return the NumPy shape in which a dense CasADi matrix (rows, columns) is passed.
+
+    It is () for a scalar, (n,) for a row or a column, and (columns, rows), the transpose, for other
+    matrices, because CasADi stores them column by column.
+    """
     if rows == 1 or columns == 1:
         return () if rows == columns else (rows * columns,)
     return (columns, rows)
@@ -148,7 +152,7 @@ class NumericFunction(ABC):
         return other
 
     def __call__(self, *inputs: ArrayLike) -> dict[str, Array]:
-        """Evaluate once.
+        """Evaluate the function for one set of inputs.
 
         Args:
             inputs: one array per input, of its shape in `input_shapes`.
@@ -171,13 +175,13 @@ class NumericFunction(ABC):
         return {name: block[name] for name in self.output_names}
 
     def batch(self, *inputs: ArrayLike, threads: int = 1) -> dict[str, Array]:
-        """Evaluate n candidates.
+        """Evaluate the function for n sets of inputs, called candidates.
 
         Args:
             inputs: one array per input: (n, ...) with its shape in `input_shapes` after n, or of
                 this shape alone, shared by all candidates.
-            threads: threads to spread the candidates over; 0 for one per core that this process
-                may use. The results do not depend on it. Interpreted functions use one.
+            threads: threads to spread the candidates over; 0 for one per core that this process may
+                use. The results do not depend on it. Interpreted functions use one.
 
         Returns:
             The outputs by name, each (n, ...) with its shape in `output_shapes` after n.
@@ -419,10 +423,10 @@ def ports(
     batched: Sequence[bool],
     outputs: Sequence[NDArray[Any]],
 ) -> ctypes.Array[ctypes.c_longlong]:
-    """Return the description of a batch that drivers in C take (`codegen/c/driver.c`).
+    """Describe the arrays of a batch to the drivers in C (`codegen/c/driver.c`).
 
-    It has two integers per array, inputs first: the address of the array, and the step from one
-    evaluation to the next, counted in entries; 0 for an input with one value for all.
+    The result has two integers per array, inputs first: the address of the array, and the step from
+    one evaluation to the next, counted in entries; 0 for an input with one value for all.
 
     Args:
         signature: signature of the function.

@@ -177,8 +177,8 @@ class Carry(Displayable):
 
     @property
     def payload_limit(self) -> float:
-        """Payload mass [kg] at which the first of the robots reaches its reference force on the
-        same motion.
+        """Payload mass [kg] up to which neither robot exceeds its reference force on the same
+        motion.
 
         All forces grow in proportion to the mass.
         """

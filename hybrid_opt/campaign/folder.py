@@ -115,7 +115,8 @@ def environment() -> Mapping[str, str]:
 
 
 def configuration_of(settings: CampaignSettings, root: Path, workcell: Workcell) -> Configuration:
-    """Return the configuration that identifies a campaign.
+    """Return the record that identifies a campaign: its settings, its workcell, and the versions of
+    the software.
 
     Args:
         settings: settings of the campaign.

@@ -280,7 +280,7 @@ class ReplicaFunction(Protocol[ArgumentIn]):
     """Function that computes the content of a replica's file in any process."""
 
     def __call__(self, argument: ArgumentIn, progress: ShowProgress = False, /) -> bytes:
-        """Return the content of the file.
+        """Compute one replica, or its polished front, and return the content of its file.
 
         Args:
             argument: request for one replica.

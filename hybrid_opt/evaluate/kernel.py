@@ -142,7 +142,7 @@ class Kernel:
     def __init__(
         self, library: ctypes.CDLL, checker: CollisionChecker, numbers: Array, start: Array
     ) -> None:
-        """Prepare the collision shapes.
+        """Prepare the evaluation of one cell: its collision shapes, parameters and start postures.
 
         Args:
             library: compiled kernel, from `load_kernel`.

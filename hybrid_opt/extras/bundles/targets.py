@@ -81,8 +81,11 @@ class Target:
     def checks(
         self, workcell: Workcell, name: str, leader: int, any_arm: bool = False
     ) -> list[Callable[[], object]]:
-        """Return functions each of which raises a SettingsError if a cell is not for this target:
-        its hands, the maker and joints of its arms, their addresses, and their equipment.
+        """Return the checks whether a cell fits this target, as functions that raise a
+        SettingsError if it does not.
+
+        They check its hands, the maker and joints of its arms, their addresses, and their
+        equipment.
 
         Args:
             workcell: the cell.

@@ -148,8 +148,8 @@ def joint_stiffness(job: Job) -> Array:
 
 
 def pad_stiffness(job: Job) -> float:
-    """Compute the stiffness of each arm at its pad along the normal that follows from the joint
-    gains, the largest value along the job [N/m].
+    """Compute the stiffness of each arm at its pad along the contact normal, as it follows from the
+    joint gains [N/m]. The result is the largest value along the job.
 
     With normal n, pad Jacobian J and gains K, an arm's compliance is c = n' J K^-1 J' n. Both arms
     act in series, so the stiffness is 2 / (c_1 + c_2).

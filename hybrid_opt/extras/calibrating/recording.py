@@ -110,8 +110,8 @@ class Recording:
         return np.asarray((self.time >= begin) & (self.time <= end))
 
     def around(self, instant: float) -> Array:
-        """Find the samples at most half of `TARE_TIME` from an instant at which both arms stand
-        still.
+        """Find the samples within half of `TARE_TIME` before and after an instant. Both arms stand
+        still then.
 
         Args:
             instant: the instant, on the clock of the recording [s].

@@ -168,8 +168,8 @@ def _standing(problem: Problem, bases: list[Array]) -> dict[str, Any]:
 
 
 def _sideways(problem: Problem, arm: int) -> tuple[Array, Array]:
-    """Compute where a robot's contact is halfway between start and goal, and the direction away
-    from the box.
+    """Compute the middle position of a robot's contact, and in which direction it is from the
+    carry.
 
     Args:
         problem: the problem.

@@ -212,6 +212,9 @@ class Machine:
     def start(self, seen: Seen) -> None:
         """Begin the job.
 
+        Args:
+            seen: measured state of both arms.
+
         Raises:
             Refused: the arms are not ready, as `check` finds.
         """
@@ -310,8 +313,15 @@ class Machine:
         self.clock.keep(low, high)
 
     def _wait(self, dt: float, seen: Seen) -> None:
-        """Wait while the clock stands at a point where hands are switched, and continue when all
-        inputs report the commanded state."""
+        """Wait at a point of the path where hands are switched.
+
+        The clock stands at this point. The job continues when all inputs report the commanded state
+        of the hands, and is held if they do not within the time limit.
+
+        Args:
+            dt: time since the last call [s].
+            seen: measured state of both arms.
+        """
         if self.clock.turning or self._gates[:1] != [self.clock.s]:
             return
         self._waited += dt

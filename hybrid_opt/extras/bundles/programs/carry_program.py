@@ -102,8 +102,12 @@ class Carry:
         return self.machine.status()
 
     def fail(self, reason: str, lost: bool = False) -> None:
-        """Request a stop; `lost` is True if an arm does not follow its commands. The first reason
-        is kept."""
+        """Request a stop. If several are requested, the first reason is kept.
+
+        Args:
+            reason: reason of the stop.
+            lost: True if an arm does not follow its commands.
+        """
         self.fault, self.lost = self.fault or reason, self.lost or lost
 
     def interrupt(self, *_: object) -> None:

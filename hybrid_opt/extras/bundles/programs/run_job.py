@@ -225,7 +225,7 @@ class Run(Carry):
         return [force if now - then <= silence else None for force, then in both]
 
     def spin(self, until: float) -> None:
-        """Handle messages until a time [s]."""
+        """Handle ROS messages until the node's clock shows the time `until` [s]."""
         while (left := until - self.now()) > 0.0:
             rclpy.spin_once(self.node, timeout_sec=left)
 
@@ -339,8 +339,13 @@ class Run(Carry):
         return FollowJointTrajectory.Goal(trajectory=trajectory)
 
     def _joined(self, arms: Sequence[int], rows: Sequence[Sequence[Any]]) -> list[Any]:
-        """Join the values of several arms' joints to one list. A joint that moves both arms is
-        listed once, with its value of the first arm."""
+        """Join values of the joints of several arms to one list. A joint that moves both arms is
+        listed once, with its value of the first arm.
+
+        Args:
+            arms: indices of the arms.
+            rows: for each of these arms one value per joint.
+        """
         found: dict[str, Any] = {}
         for arm, row in zip(arms, rows, strict=True):
             for name, value in zip(self.job.robots[arm]["ros_joints"], row, strict=True):
