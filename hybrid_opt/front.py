@@ -256,11 +256,12 @@ def polish(
     """Improve the carries of a front by nonlinear programming and return the polished front.
 
     The polish lowers both peak normal forces. In drivable cells it lowers duration and force
-    instead, by optimising path and speed profile together.
+    instead, by optimising path and speed profile together. It makes many attempts: solves from
+    different starts that improve points of the front or fill its gaps.
 
     Args:
         front: the front to improve.
-        rng: random generator that perturbs the starts of some attempts.
+        rng: random generator of those starts that are chosen at random.
         settings: settings of the polish, None for the defaults of the cell's time law.
         paths: further good carries of the same cell from which attempts start, or their decision
             vectors (n_var,), or (n_path,) without the force limit; only for drivable cells. No

@@ -83,9 +83,8 @@ def thin(
 ) -> Indices:
     """Choose the members that stay if the archive is over capacity.
 
-    Members are removed from the fullest hypercubes, until the hypercubes that lost members are
-    equally full. Within a hypercube newcomers are removed before old members; otherwise chance
-    decides.
+    Members are removed one by one, always from a hypercube that has the most. Within a hypercube
+    newcomers are removed before old members; otherwise chance decides.
 
     Args:
         cubes: (n,) hypercube number of each member.

@@ -167,11 +167,11 @@ class Evaluator(Protocol):
 
 
 def reject_non_finite(evaluations: Evaluations) -> Evaluations:
-    """Return the evaluations, with every candidate made infeasible that has a NaN or infinite
-    violation, penalised objective or, if it was feasible, objective.
+    """Return the evaluations, with every candidate made infeasible whose values are not all finite.
 
-    Such a candidate gets `WORST_PENALTY` and the reason `NOT_FINITE`. Objectives of a candidate
-    that was infeasible before may be NaN or infinite, since only its penalised objectives count.
+    A violation or penalised objective that is NaN or infinite makes any candidate infeasible, an
+    objective only a feasible one: the objectives of infeasible candidates do not count. Such a
+    candidate gets the penalised objectives `WORST_PENALTY` and the reason `NOT_FINITE`.
     """
     finite = np.isfinite(evaluations.violation).all(axis=1)
     finite &= np.isfinite(evaluations.violation_time).all(axis=1)
@@ -224,9 +224,9 @@ class CarryProblem(Problem):  # type: ignore[misc]
             evaluator: evaluator of the candidates.
             handling: 'penalty' or 'constraints', see the class.
             evaluated: function called after each batch with the number of candidates in the batch.
-            task: task of the evaluated candidates. Pymoo varies only the waypoints that the
-                workcell file states; further waypoints of the task follow from them. None varies
-                the evaluator's own variables.
+            task: task of the evaluator. If it has intermediate waypoints beside those of the
+                workcell file, pymoo varies only the latter, and the intermediate ones lie on the
+                path through them. None to vary all variables of the evaluator.
         """
         self.task = task if task is not None and task.pieces > 1 else None
         self.drawn = None if self.task is None else coarse_task(self.task)
@@ -396,9 +396,9 @@ def search_carries(
         rng: random generator of the whole run.
         settings: settings of the search.
         evaluated: function called after each batch with the number of candidates in the batch.
-        task: task of the candidates. Only the waypoints that the workcell file states are varied;
-            further waypoints of the task follow from them. None varies the evaluator's own
-            variables.
+        task: task of the evaluator. If it has intermediate waypoints beside those of the workcell
+            file, the search varies only the latter, and the intermediate ones lie on the path
+            through them. None to vary all variables of the evaluator.
 
     Returns:
         The evaluations of all candidates in order, and the generation (n,) of each, from 1.

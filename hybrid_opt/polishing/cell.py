@@ -240,8 +240,8 @@ def local_minima_below(values: Array, limit: float, stride: int | None = None) -
     Args:
         values: (n,) values along the path.
         limit: the limit, in the unit of the values.
-        stride: distance, as a number of values, at which further points of each stretch are
-            returned on both sides of the lowest value; None for the lowest values alone.
+        stride: None to find only the lowest values. A number k to find also every k-th value before
+            and after the lowest one, up to the ends of its stretch.
 
     Returns:
         Indices of the values found.
@@ -353,11 +353,12 @@ class Distances:
         self._unmeasured[points, pairs] = False
 
     def least(self, stretches: Sequence[Stretch], below: float) -> list[float]:
-        """Return the least distance [m] in each of several stretches of the path.
+        """Return the least distance [m] in each of several stretches of the path, with as few
+        measurements as possible.
 
         In a stretch the distance with the lowest bound is measured first, then the next one, until
         a measured distance is below all remaining bounds. If all bounds of a stretch reach `below`,
-        the least bound is returned.
+        nothing is measured and the least bound is returned.
 
         Args:
             stretches: for each stretch, the slice of its successive points and the index of the

@@ -134,17 +134,23 @@ def extreme_attempt(
 ) -> ForceAttempt:
     """Return an attempt at an end of the front or at its balanced middle.
 
-    The attempt starts from the best known point. If this start was tried already, or if the last
-    attempt brought no progress, it starts elsewhere: at an end from a random perturbation of the
-    best point, because ends lie in several basins; at the middle from a random untried point of the
-    archive, which may be dominated.
+    The attempt starts from the best known point. It starts elsewhere if that start was tried
+    already, or if the last attempt brought no progress:
+
+    - At an end: from the best feasible one of random perturbations of the best point, because ends
+      may have several local optima.
+    - At the middle, or if no perturbation is feasible: from a random untried point of the archive,
+      which may be dominated.
+
+    If every point was tried, it starts from the best point again with a small trust region.
 
     Args:
         archive: the points of the front and other known points.
         objective: index of the objective that is least at the end; None for the balanced middle.
         tried: objective (None for the middle) and start, as bytes, of all attempts so far.
         stalled: True if the last attempt brought no progress.
-        perturb: function from a decision vector and an objective to a perturbed start.
+        perturb: function from a decision vector and an objective to a perturbed start, None if
+            there is none.
         rng: generator that chooses the untried point.
     """
     radius, k = RADIUS, archive.best(objective)[0]

@@ -272,8 +272,10 @@ class IntervalValues:
         return value.reshape(-1) / whole, slope.reshape(-1, grid.moving) / whole
 
     def rows(self) -> Array:
-        """Return the left sides (points, k) of the k inequalities at every point: linear
-        combinations of the limited quantities, without unit, each at most its bound."""
+        """Return the left sides (points, k) of the k inequalities at every point: normal forces
+        [N], and all other limited quantities over their limits. Each is at most its bound, the
+        force limit or 1.
+        """
         return np.asarray(self.value @ self._grid.kinds.mix.T)
 
     def curvature(self, weight: Array) -> tuple[NDArray[np.intp], Array]:

@@ -503,8 +503,8 @@ class Alternative:
 def time_alternative(
     cell: Cell, label: str, path: Array, timing: Timing, force: float
 ) -> Alternative:
-    """Compare a path with the recommended carry: time it at that carry's commanded force, and find
-    the least force in that carry's duration.
+    """Compare a path with the recommended carry: find its shortest duration with the carry's
+    commanded force, and its least commanded force within the carry's duration.
 
     Args:
         cell: drivable cell.

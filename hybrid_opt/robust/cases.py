@@ -90,8 +90,10 @@ def worst_cases(contact: ContactModel, uncertainty: Uncertainty, leader: int = 0
 def random_cases(
     workcell: Workcell, uncertainty: Uncertainty, n: int, rng: np.random.Generator, leader: int = 0
 ) -> Array:
-    """Draw n random cases (n, 18), uniformly distributed in the ranges of the uncertainty and in
-    the discs of pad positions.
+    """Draw n random cases (n, 18) of an uncertainty.
+
+    Quantities are uniformly distributed in their ranges; displacements of pads are uniformly
+    distributed in discs on the faces.
 
     Args:
         workcell: the cell with the nominal values.
@@ -210,12 +212,12 @@ def governing_cases(
     difference: Array | None = None,
     leading_share: float = 1.0,
 ) -> GoverningCases:
-    """Find for each of n samples the worst cases that decide the normal forces: the case with the
-    largest commanded force, and the case that adds most to the position-controlled arm's force.
+    """Find for each of n samples the two worst cases that decide the normal forces.
 
-    The position-controlled arm's force is `leading_share` times the commanded force plus a
-    difference. The motion and the case fix this difference, which is proportional to the mass and
-    does not depend on the squeeze.
+    - The case with the largest commanded force.
+    - The case that adds most to the position-controlled arm's force. This force is `leading_share`
+      times the commanded force plus a difference, which the motion and the case determine. The
+      difference is proportional to the mass and does not depend on the squeeze.
 
     Args:
         worst: (k, n, 2) least normal forces of both robots in k cases at n samples [N].

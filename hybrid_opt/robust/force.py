@@ -245,8 +245,9 @@ class RobustModel:
     def slack(
         self, motion: HeldMotion, cases: Array, force: Array, leader: int, threads: int = 1
     ) -> Array:
-        """Test whether commanded forces hold the box at m samples, each in a case of its own, by
-        the compiled function `case_slack_function`.
+        """Test fast whether commanded forces hold the box at m samples, each in a case of its own,
+        by the compiled function `case_slack_function`. `least` decides the cases that the test
+        leaves open.
 
         Args:
             motion: box motion at m samples.
@@ -256,8 +257,8 @@ class RobustModel:
             threads: number of threads, 0 for one per core.
 
         Returns:
-            Slack (m,). A positive slack proves that the force holds the box in the case; a negative
-            slack proves nothing.
+            Slack (m,), of which only the sign counts. A positive slack proves that the force holds
+            the box in the case; a negative slack proves nothing.
         """
         given = *motion_inputs(motion), cases, force
         return self._slack(1 - leader).batch(*given, threads=threads)["slack"].ravel()

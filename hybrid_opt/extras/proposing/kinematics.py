@@ -43,8 +43,8 @@ SAME_PATCH = 1e-6
 
 @cache
 def compiled_newton() -> Any:
-    """Return the compiled module of `newton.cpp`. It is the same for every arm and was compiled at
-    installation.
+    """Return the compiled module of `newton.cpp`, which solves the inverse kinematics of many
+    postures by Newton's method. It is the same for every arm and was compiled at installation.
 
     Raises:
         BridgeError: it is missing or cannot be loaded.
@@ -213,8 +213,10 @@ class ArmKinematics:
                 that also move the other arm then follow `ends`; they move freely if `ends` is None.
 
         Returns:
-            - Joint paths (m, n, joints) [rad or m].
-            - Number (n,) of poses that each posture reaches before a joint jumps.
+            - Joint paths (m, n, joints) [rad or m]; a path stays at its last position where it
+              ends.
+            - Number (n,) of poses on each path. A path ends before a pose that the arm does not
+              reach, or only by a jump of a joint.
             - Manipulability (m, n) [m^3], negative beyond a singular posture.
         """
         m, n = len(targets), len(q)

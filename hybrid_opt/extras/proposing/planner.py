@@ -73,8 +73,8 @@ class AffineSubspace:
     range: float
 
     def extended(self, y: Array) -> Array:
-        """Compute the box pose followed by m redundant joints (6 + m,) at a coordinate of the
-        subspace.
+        """Convert a coordinate of the subspace to the box pose [m, rad] followed by the m redundant
+        joints [rad or m], (6 + m,).
 
         Args:
             y: (d,) coordinate [m].
@@ -82,7 +82,8 @@ class AffineSubspace:
         return np.asarray(self.origin + self.directions @ y)
 
     def coordinates(self, extended: Array) -> Array:
-        """Compute the coordinate (d,) [m] in the subspace of a box pose with redundant joints.
+        """Convert a box pose with redundant joints to the coordinate (d,) [m] of the nearest vector
+        of the subspace.
 
         Args:
             extended: (6 + m,) box pose [m, rad] followed by the m redundant joints [rad or m].

@@ -315,8 +315,9 @@ class _Search:
 
     @property
     def too_late(self) -> bool:
-        """True if the remaining time does not suffice for another path with its evaluation and its
-        bounds."""
+        """True if the share `PLANNING` of the allowed time is over. The rest is for the evaluation
+        of paths and the search for bounds, and no further path is planned.
+        """
         return self.spent > PLANNING * self.settings.seconds
 
     def _say(self, text: str) -> None:

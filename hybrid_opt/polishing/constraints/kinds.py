@@ -419,12 +419,13 @@ class RowSelector:
         """Return the rows (scalar inequalities) of all kinds of constraints that are violated after
         a step.
 
+        A force row of the program never counts as violated: it bounds the force by the peak force,
+        which is itself a variable to be minimised.
+
         Args:
             carry: candidate after the step.
             known: candidate before the step.
-            program_rows: rows of the optimisation problem whose solution is the step. Force rows
-                among these never count as violated, because a force above its peak only raises the
-                peak.
+            program_rows: rows of the optimisation problem whose solution is the step.
         """
         rows = set[Row]()
         for kind in self._kinds.values():
@@ -440,12 +441,12 @@ class RowSelector:
         """Return True if a candidate violates any constraint after a step.
 
         Distances are the most expensive, so they are checked last and only until one is too small.
+        Force rows of the program never count as violated, as in `violated_rows`.
 
         Args:
             carry: candidate after the step.
             known: candidate before the step.
-            program_rows: rows of the program that proposed the step. Force rows among these never
-                count as violated.
+            program_rows: rows of the optimisation problem whose solution is the step.
         """
         return any(
             row not in program_rows or not isinstance(row, ForceRow)
