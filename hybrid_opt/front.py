@@ -135,8 +135,8 @@ class Front(Displayable):
     def balanced(self) -> Carry:
         """Return the carry with the least mean of the two robots' peak normal forces.
 
-        Means whose relative difference is below `TIE` count as equal. Among such carries the one
-        whose more loaded robot has the lower peak is returned.
+        Means whose relative difference is below `TIE` count as equal. Of carries with equal means,
+        the one with the smallest maximum of both peaks is returned.
 
         Raises:
             SettingsError: the front is empty.
@@ -326,8 +326,8 @@ class SelectedCarry:
 def balanced(peak_normal_force: Array) -> int:
     """Return the index of the carry with the least mean of both robots' peak normal forces.
 
-    Means whose relative difference is below `TIE` count as equal. Among such carries the one whose
-    more loaded robot has the lower peak is chosen.
+    Means whose relative difference is below `TIE` count as equal. Of carries with equal means, the
+    one with the least larger peak of both robots is chosen.
 
     Args:
         peak_normal_force: (k, 2) peak normal force of each robot in k carries [N].

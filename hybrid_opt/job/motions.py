@@ -415,7 +415,7 @@ def pressing(
     """Compute a phase in which the contact forces rise from zero, or fall to zero, while box and
     arms stand still.
 
-    All forces have the same profile in time, and the load on the support of the box falls as they
+    All forces rise with the same profile in time, and the support of the box is relieved as they
     rise. So the ratio of tangential to normal force is that of the held box throughout.
 
     Args:

@@ -332,9 +332,9 @@ class Distances:
             limits: (n_pairs,) limit of each pair [m].
 
         Returns:
-            By index of the pair, distances (n,) at all points [m], for each pair whose lower bound
-            is below its limit at some point. Distances are measured at these points; elsewhere a
-            lower bound may take the place of the distance.
+            Distances (n,) at all points [m] by index of the pair, for each pair whose lower bound
+            is below its limit at some point. At points with a bound below the limit the distances
+            are measured; at the other points they may be lower bounds.
         """
         close = self.interpolated_clearance < limits
         self._measure_pairs(*(close & self._unmeasured).nonzero())

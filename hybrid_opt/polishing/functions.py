@@ -128,10 +128,10 @@ def polish_functions(compiled: CompiledCell) -> PolishFunctions:
 
     Functions of many samples or points per call are compiled for evaluation in lanes (several
     evaluations by one vector instruction) at optimisation level 1. Higher levels take three times
-    as long to compile and gain nothing: on the rack the run times of all functions but one changed
-    by less than 5 %, and this one became 40 % slower. For the first and the last two samples, only
-    second derivatives are evaluated in lanes. Functions of whole paths multiply sparse matrices and
-    have no form for lanes.
+    as long to compile, without faster functions: in a measurement all run times changed by less
+    than 5 %, except one, which rose by 40 %. For the first and the last two samples, only second
+    derivatives are evaluated in lanes. Functions of whole paths multiply sparse matrices and have
+    no form for lanes.
 
     Raises:
         DualArmError: the cell's model cannot be built, or its functions cannot be compiled.

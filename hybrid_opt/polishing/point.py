@@ -335,8 +335,9 @@ class WorkingSet:
         """Raise the values that rows (scalar inequalities) have to exceed in the next step towards
         the tightened bounds that rejected steps gave them.
 
-        Only a share of the difference between tightened bound and value is added: the radius of the
-        trust region over the distance to the candidate at which the bound was tightened, at most 1.
+        A value is raised by a share of its distance to the tightened bound. The share is the radius
+        of the trust region over the distance to the candidate at which the bound was tightened, at
+        most 1.
 
         Args:
             required: value that each row has to exceed, changed in place.

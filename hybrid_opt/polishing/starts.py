@@ -187,11 +187,11 @@ class Mirror:
 
 
 def mirror_of(workcell: Workcell) -> Mirror | None:
-    """Return the reflection that exchanges both arms: about the vertical plane midway between their
-    bases.
+    """Return the reflection of the cell that exchanges both arms: about the vertical plane midway
+    between their bases.
 
-    None if the line between the bases is not parallel to a horizontal world axis, if the arms have
-    redundant joints, or if the reflection moves a fixed waypoint of the box.
+    None is returned in three cases: the line between the bases is not parallel to a horizontal
+    world axis, the arms have redundant joints, or the reflection moves a fixed waypoint of the box.
     """
     task = workcell.task
     first, second = (robot.T_world_base[:3, 3] for robot in workcell.robots)

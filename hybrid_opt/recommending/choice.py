@@ -285,8 +285,8 @@ class DrivenPaths:
         return np.array([timing.duration for _, _, timing in self._driven(force)])
 
     def options(self, force: Array | float, rows: Sequence[int] | None = None) -> list[Option]:
-        """Compute the fastest timing of paths within force limits; paths without such a timing are
-        left out.
+        """Compute the fastest timing of paths within force limits. Paths that have none within
+        their limit are left out.
 
         Args:
             force: force limit, one per timed path or one for all [N].

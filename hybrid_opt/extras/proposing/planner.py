@@ -189,8 +189,8 @@ def straight_paths(
     """Yield collision-free paths of three straight motions, shorter ones first.
 
     The motions are a retreat from the start, a motion across, and the reverse of a retreat from the
-    goal. Both retreats have the same direction, or two different axes of the world; each such pair
-    of directions gives at most one path.
+    goal. Both retreats have the same direction, or two different axes of the world as directions.
+    At most one path is yielded for each pair of directions.
 
     Args:
         chain: both arms, whose pads stay fixed on the box.

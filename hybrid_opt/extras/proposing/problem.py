@@ -92,13 +92,15 @@ class Problem:
 
     @cached_property
     def contacts(self) -> list[dict[str, Any]]:
-        """The two tables of contacts as they stand in a file, with the positions of pads or hands
-        on the box.
+        """The two entries of `contacts` in the workcell file, with the positions of the pads or
+        hands on the box.
 
-        Positions in the file are kept. Otherwise hands that grip by themselves are at the first
-        proposal of `hand_positions`, and pads at the centres of the two opposite faces that face
-        the robots' bases or a machine's shoulders. Without bases in the file, pads are on the faces
-        beside the direction of the carry.
+        Positions that the file states are kept. Otherwise:
+
+        - Hands that grip by themselves are at the first proposal of `hand_positions`.
+        - Pads are at the centres of the two opposite faces that face the robots' bases, or the
+          shoulders of a machine with two arms. Without bases in the file, they are on the faces
+          beside the direction of the carry.
 
         Raises:
             WorkcellError: the file describes robots whose shoulders cannot be found, or no face has
@@ -140,7 +142,7 @@ class Problem:
 
     @cached_property
     def _hand_positions(self) -> list[list[dict[str, Any]]]:
-        """The two tables of contacts as they stand in a file, for each proposed placement of the
+        """The two entries of `contacts` in the workcell file, for each proposed placement of the
         arms' hands; the best first.
 
         Raises:

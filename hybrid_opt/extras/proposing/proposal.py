@@ -398,8 +398,13 @@ class _Search:
                     yield from self._judged(lazy.setup, pair, via, box)
 
     def _is_known(self, pair: Pair, box: PayloadSceneChecker, path: Array) -> bool:
-        """Return True if a carry was found before that has the holds `pair` of both arms and passes
-        the obstacles on the same sides as the box poses `path` (n, 6) [m, rad].
+        """Return True if a carry of the same class was found before: with the same holds, and past
+        the obstacles on the same sides.
+
+        Args:
+            pair: the holds of both arms.
+            box: collision checker of the box, which names the passed sides.
+            path: (n, 6) box poses of the carry [m, rad].
         """
         return bool(self.known) and (id(pair), box.sides_passed(path)) in self.known
 

@@ -127,8 +127,12 @@ class PayloadSceneChecker:
 def _passage(
     boxes: list[tuple[Piece, ...]], standing: Mapping[str, tuple[Piece, ...]], name: str, way: Array
 ) -> str:
-    """Return a text on how the box passes a fixed body: the side with the largest gap while the box
-    is beside it, or whether the box is between parts of this body or between it and another one.
+    """Return a text on how the box passes a fixed body: through it, between it and another body, or
+    on which side of it.
+
+    'through' means that parts of the body lie on two opposite sides of the box when it is beside
+    the body. Else the side is the one with the largest gap; 'between' means that another body lies
+    on the same side of the box.
 
     Args:
         boxes: solids of the box at each pose of the path.

@@ -99,10 +99,10 @@ class Forces(ConstraintKind[ForceRow]):
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[ForceRow]:
         """Return rows (scalar inequalities) of normal forces at regular distances along the path,
-        and at and beside the local maxima of the normal forces.
+        at both of its ends, and at and beside the local maxima of the normal forces.
 
-        A robot whose force is not minimised, but only decides between equal candidates, has rows at
-        fewer samples.
+        A robot whose force is not minimised has rows at fewer samples; its force only decides
+        between candidates that are otherwise equal.
 
         Args:
             carry: the candidate, evaluated at points of the path.
