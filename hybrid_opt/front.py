@@ -327,7 +327,7 @@ def balanced(peak_normal_force: Array) -> int:
     """Return the index of the carry with the least mean of both robots' peak normal forces.
 
     Means whose relative difference is below `TIE` count as equal. Of carries with equal means, the
-    one with the least larger peak of both robots is chosen.
+    one with the smallest maximum of both peaks is chosen.
 
     Args:
         peak_normal_force: (k, 2) peak normal force of each robot in k carries [N].
