@@ -41,8 +41,8 @@ from symbolic.records.task import initial_decision
 if TYPE_CHECKING:
     # Not imported at run time before they are needed: a search needs none of them.
     from hybrid_opt.collision.certify import Certificate
+    from hybrid_opt.polishing.front import Polisher
     from hybrid_opt.polishing.functions import PolishFunctions
-    from hybrid_opt.polishing.polisher import Polisher
     from hybrid_opt.polishing.settings import PolishSettings
     from hybrid_opt.robust.budget import GripBudget
     from hybrid_opt.timing.model import TimingModel
@@ -243,10 +243,10 @@ class Cell:
             SettingsError: the polish does not support the cell's objectives or pads.
         """
         # Not imported at the top: solvers take long to load.
-        from hybrid_opt.polishing.polisher import Polisher
+        from hybrid_opt.polishing.polisher import make_polisher
 
         if settings not in self._polishers:
-            polisher = Polisher(self.evaluator, settings, self.polish_functions)
+            polisher = make_polisher(self.evaluator, settings, self.polish_functions)
             self._polishers[settings] = polisher
         return self._polishers[settings]
 

@@ -16,15 +16,19 @@ from typing import Literal
 
 import numpy as np
 
+from hybrid_opt.evaluate.evaluation import CandidateEvaluator
+from hybrid_opt.polishing.cell import SmoothCell
 from hybrid_opt.polishing.drive import REST_FORCE_MARGIN, DriveStepMethod
 from hybrid_opt.polishing.front import (
     LEAST_SPAN,
     Attempt,
     ParetoArchive,
+    Polisher,
     PolishRun,
     Solution,
     Status,
 )
+from hybrid_opt.polishing.functions import PolishFunctions
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.starts import rotated_starts
 from hybrid_opt.timing.model import TimingModel
@@ -376,3 +380,27 @@ class DriveRun(PolishRun[DriveAttempt]):
             return self._not_improved(answer, attempt)
         reason = recheck_timing(self._driver, self._timings, answer.x)
         return ("rejected", reason, attempt.start) if reason else ("accepted", "", objectives)
+
+
+class DrivePolisher(Polisher):
+    """Polishes fronts of drivable carries, path and timing together.
+
+    Attributes:
+        drive_method: step method of drivable carries.
+    """
+
+    solver_name = "quadratic"
+
+    def __init__(
+        self, evaluator: CandidateEvaluator, settings: PolishSettings, functions: PolishFunctions
+    ) -> None:
+        super().__init__(evaluator, settings)
+        self.drive_method = DriveStepMethod(SmoothCell(evaluator, functions, settings.clearance))
+        self._timings = TimingModel(evaluator.compiled, self.drive_method.driver.timer.intervals)
+
+    def new_run(
+        self, archive: ParetoArchive, on_progress: Callable[[int, int], None], paths: Array
+    ) -> DriveRun:
+        """Return the polish of one front, see `Polisher.new_run`."""
+        given = archive, on_progress, paths
+        return DriveRun(self.drive_method, self.settings, self._timings, *given)

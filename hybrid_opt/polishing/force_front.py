@@ -24,6 +24,7 @@ from math import ceil
 import numpy as np
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator, Evaluations
+from hybrid_opt.polishing.cell import SmoothCell
 from hybrid_opt.polishing.force import (
     ForceSolver,
     Scalarisation,
@@ -38,11 +39,13 @@ from hybrid_opt.polishing.front import (
     Aim,
     Attempt,
     ParetoArchive,
+    Polisher,
     PolishOutcome,
     PolishRun,
     Solution,
     Status,
 )
+from hybrid_opt.polishing.functions import PolishFunctions
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.starts import Start, mirror_of, perturb_start, random_starts
 from symbolic.array import Array, evenly
@@ -650,3 +653,24 @@ class ForceRun(PolishRun[ForceAttempt]):
             yield attempt
             gained = self._archive.best(objective)[1] < before - LEAST_PROGRESS
             self._stalls[objective] = 0 if gained else stalls + 1
+
+
+class ForcePolisher(Polisher):
+    """Polishes fronts of both peak forces."""
+
+    def __init__(
+        self, evaluator: CandidateEvaluator, settings: PolishSettings, functions: PolishFunctions
+    ) -> None:
+        super().__init__(evaluator, settings)
+        self._solver = ForceSolver(SmoothCell(evaluator, functions, settings.clearance), settings)
+
+    @property
+    def solver_name(self) -> str:
+        """Name of the solver of the programs, see `PolishedFront.solver`."""
+        return self.settings.solver
+
+    def new_run(
+        self, archive: ParetoArchive, on_progress: Callable[[int, int], None], paths: Array
+    ) -> ForceRun:
+        """Return the polish of one front, see `Polisher.new_run`; it uses no known paths."""
+        return ForceRun(self._solver, self.settings, archive, on_progress)

@@ -1,5 +1,5 @@
-"""A front during its polish: its archive, the processing of every attempt, and the records that a
-polish returns and stores.
+"""A polish of fronts: the records that it returns and stores, a front during its polish with its
+archive and the processing of every attempt, and the polisher of a cell.
 
 Attempts are solved, evaluated and recorded one after the other. The full evaluator checks every
 answer and certifies it between the samples before it is accepted.
@@ -17,11 +17,16 @@ from typing import Annotated, Any, Generic, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from codegen.native import one_thread
 from hybrid_opt.evaluate.evaluation import FEASIBLE, REASONS, CandidateEvaluator, Evaluations
 from hybrid_opt.evaluate.objectives import non_dominated
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.solvers.base import UNKNOWN, Residuals
 from symbolic.array import AllowMissing, Array, Count, Figure, Range, Shape
+from symbolic.records.task import initial_decision
+
+TIMED_EVALUATIONS = 32
+"""Number of candidates whose evaluation is timed; the cost of a polish is stated in evaluations."""
 
 LEAST_SPAN = 2e-3
 """Least scale of an objective, for a front with one point or a nearly flat front."""
@@ -453,3 +458,86 @@ class PolishRun(ABC, Generic[AnyAttempt]):
         if answer.converged or answer.residuals.stationarity <= OPTIMAL_STATIONARITY:
             return "optimal", "not improved", attempt.start
         return "failed", f"not improved: {answer.message}", attempt.start
+
+
+class Polisher(ABC):
+    """Polishes fronts of one cell. Reuse one object for several fronts, because it loads functions.
+
+    Attributes:
+        evaluator: evaluator of candidates by the full model.
+        settings: settings of the polish.
+    """
+
+    def __init__(self, evaluator: CandidateEvaluator, settings: PolishSettings) -> None:
+        self.evaluator, self.settings = evaluator, settings
+
+    @property
+    @abstractmethod
+    def solver_name(self) -> str:
+        """Name of the solver of the programs, see `PolishedFront.solver`."""
+
+    @abstractmethod
+    def new_run(
+        self, archive: ParetoArchive, on_progress: Callable[[int, int], None], paths: Array
+    ) -> PolishRun[Any]:
+        """Return the polish of one front, before its first attempt.
+
+        Args:
+            archive: the front to be polished.
+            on_progress: function called with the number of finished attempts and the expected
+                total.
+            paths: (m, n_path) free waypoints of known good paths, as for `polish`.
+        """
+
+    def polish(
+        self,
+        front_x: Array,
+        rng: np.random.Generator,
+        paths: Array | None = None,
+        on_progress: Callable[[int, int], None] = lambda done, total: None,
+    ) -> PolishedFront:
+        """Polish a front.
+
+        Args:
+            front_x: (k, n_var) decision vectors of the front; k may be 0.
+            rng: generator of random starts.
+            paths: (m, n_path) free waypoints of known good paths, not necessarily on the front;
+                only the polish of drivable carries uses them. None for none.
+            on_progress: function called with the number of finished attempts and the expected
+                total.
+        """
+        begin = time.perf_counter()
+        x = np.asarray(front_x, dtype=float).reshape(-1, self.evaluator.n_var)
+        unit = self._evaluation_seconds(x)
+        found = self.evaluator.certified(self.evaluator.evaluate(x))
+        feasible = np.flatnonzero(found.feasible)
+        archive = ParetoArchive(x[feasible], found.objectives[feasible], feasible.tolist())
+        known = np.empty((0, self.evaluator.workcell.task.n_path)) if paths is None else paths
+        run = self.new_run(archive, on_progress, known)
+        if len(feasible) and self.settings.attempts:
+            with one_thread():
+                run.run(rng)
+        on_progress(len(run.outcomes), len(run.outcomes))
+        rows = archive.front_indices() if len(feasible) else []
+        return PolishedFront(
+            x=np.array([archive.x[k] for k in rows]).reshape(-1, self.evaluator.n_var),
+            objectives=np.array([archive.objectives[k] for k in rows]).reshape(-1, 2),
+            parent=np.array([archive.parent[k] for k in rows], dtype=np.int64),
+            polished=np.array([archive.polished[k] for k in rows], dtype=bool),
+            outcomes=tuple(run.outcomes),
+            seconds=time.perf_counter() - begin,
+            evaluation_seconds=unit,
+            solver=self.solver_name,
+        )
+
+    def _evaluation_seconds(self, x: Array) -> float:
+        """Measure the time of one candidate's evaluation [s].
+
+        Args:
+            x: (k, n_var) candidates to evaluate; the hand-made trajectory if k is 0.
+        """
+        sample = x if len(x) else initial_decision(self.evaluator.workcell.task)[None]
+        batch = np.resize(sample, (TIMED_EVALUATIONS, self.evaluator.n_var))
+        begin = time.perf_counter()
+        self.evaluator.evaluate(batch)
+        return (time.perf_counter() - begin) / len(batch)

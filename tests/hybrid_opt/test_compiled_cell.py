@@ -29,7 +29,7 @@ from hybrid_opt.cell import Cell
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate import kernel
 from hybrid_opt.job.plan import JobCollisions
-from hybrid_opt.polishing.polisher import Polisher
+from hybrid_opt.polishing.polisher import make_polisher
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.progress import Progress
 from hybrid_opt.robust.force import RobustModel, robust_model
@@ -167,7 +167,7 @@ def test_nothing_is_compiled_after_everything_was_built(monkeypatch: pytest.Monk
     monkeypatch.setattr(Compiler, "compile", refuse)
     cell = Cell.load(RACK)
     for each in (cell, cell.drivable()):
-        assert Polisher(each.evaluator, PolishSettings()) is not None
+        assert make_polisher(each.evaluator, PolishSettings()) is not None
         assert TimingModel(each.compiled).joint_names
         assert JobCollisions(each.compiled).geometry.active
         assert RobustModel(each.workcell).workcell is each.workcell

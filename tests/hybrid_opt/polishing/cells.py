@@ -12,10 +12,10 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.polishing.cell import SmoothCell
 from hybrid_opt.polishing.drive import DriveStepMethod
-from hybrid_opt.polishing.drive_front import recheck_timing
-from hybrid_opt.polishing.front import Solution
+from hybrid_opt.polishing.drive_front import DrivePolisher, recheck_timing
+from hybrid_opt.polishing.front import Polisher, Solution
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
-from hybrid_opt.polishing.polisher import Polisher
+from hybrid_opt.polishing.polisher import make_polisher
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.path_timer import CandidateDriver
@@ -57,7 +57,7 @@ def functions() -> PolishFunctions:
 def polisher() -> Polisher:
     """Of the drivable rack, for small fronts."""
     settings = DrivableSettings(first_rounds=8, rounds=3, members=8)
-    return Polisher(evaluator(), PolishSettings(attempts=4, drivable=settings), functions())
+    return make_polisher(evaluator(), PolishSettings(attempts=4, drivable=settings), functions())
 
 
 def drive_method() -> DriveStepMethod:
@@ -67,7 +67,7 @@ def drive_method() -> DriveStepMethod:
 
 def drive_method_of(owner: Polisher) -> DriveStepMethod:
     """How a polisher of drivable carries polishes one."""
-    assert owner.drive_method is not None
+    assert isinstance(owner, DrivePolisher)
     return owner.drive_method
 
 

@@ -13,7 +13,7 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.polishing.drive import DriveStepMethod
 from hybrid_opt.polishing.front import Solution
-from hybrid_opt.polishing.polisher import Polisher
+from hybrid_opt.polishing.polisher import make_polisher
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.timing.model import REFINEMENT, TimingModel
 from hybrid_opt.timing.records import TimingLimits
@@ -112,7 +112,7 @@ def compiled() -> CompiledCell:
 @cache
 def open_way() -> DriveStepMethod:
     evaluator = CandidateEvaluator(compiled().workcell, DRIVABLE_OBJECTIVES, compiled=compiled())
-    return drive_method_of(Polisher(evaluator, PolishSettings()))
+    return drive_method_of(make_polisher(evaluator, PolishSettings()))
 
 
 @cache

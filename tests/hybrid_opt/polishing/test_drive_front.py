@@ -12,7 +12,7 @@ from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES, duration_unit
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing.front import PolishedFront
-from hybrid_opt.polishing.polisher import Polisher
+from hybrid_opt.polishing.polisher import make_polisher
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
 from symbolic.array import Array
 from symbolic.errors import SettingsError
@@ -91,7 +91,7 @@ def test_known_paths_take_part() -> None:
     sunk = known.copy()
     sunk[0, [2, 8, 14]] -= 0.2
     settings = DrivableSettings(first_rounds=1, rounds=1, members=4)
-    owner = Polisher(evaluator(), PolishSettings(attempts=1, drivable=settings), functions())
+    owner = make_polisher(evaluator(), PolishSettings(attempts=1, drivable=settings), functions())
     rng = np.random.default_rng
     front = owner.polish(starts(), rng(0), paths=np.vstack([known, sunk]))
     forces = np.array([50.0, 53.0, 55.0])
@@ -106,7 +106,7 @@ def test_they_do_so_at_the_front_door() -> None:
         attempts=1, drivable=DrivableSettings(first_rounds=1, rounds=1, members=2)
     )
     known, rng = tilted(55.0), np.random.default_rng
-    owner = Polisher(evaluator(), settings, functions())
+    owner = make_polisher(evaluator(), settings, functions())
     wanted = owner.polish(starts(), rng(0), paths=known[None, :-1])
     cell = ho.Cell(drivable_rack(), DRIVABLE_OBJECTIVES)
     found = evaluator().evaluate(starts())
@@ -127,4 +127,4 @@ def test_other_objectives_are_refused() -> None:
         drivable_rack(), ("duration", "mean_force"), compiled=evaluator().compiled
     )
     with refused(SettingsError, "objectives", "mean_force"):
-        Polisher(other, PolishSettings(), functions())
+        make_polisher(other, PolishSettings(), functions())

@@ -12,7 +12,7 @@ import pytest
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import front_of, non_dominated
 from hybrid_opt.indicators import metrics
-from hybrid_opt.polishing import polisher as polisher_module
+from hybrid_opt.polishing import force_front
 from hybrid_opt.polishing.force import ForceSolver, Scalarisation, SolveMode, pascoletti_serafini
 from hybrid_opt.polishing.force_front import (
     FAR_GAP,
@@ -30,9 +30,10 @@ from hybrid_opt.polishing.front import (
     OPTIMAL_STATIONARITY,
     ParetoArchive,
     PolishedFront,
+    Polisher,
     Solution,
 )
-from hybrid_opt.polishing.polisher import Polisher
+from hybrid_opt.polishing.polisher import make_polisher
 from hybrid_opt.polishing.settings import FillSettings, PolishSettings, ProbeSettings
 from studies.research.best_front import read_reference_front
 from symbolic.array import Array
@@ -69,7 +70,7 @@ def start_front() -> Array:
 
 @cache
 def polisher() -> Polisher:
-    return Polisher(evaluator(), SETTINGS)
+    return make_polisher(evaluator(), SETTINGS)
 
 
 TOLD: list[tuple[int, int]] = []
@@ -175,7 +176,7 @@ def test_what_it_cost_is_told_in_evaluations() -> None:
 
 def test_a_front_of_one_point() -> None:
     one = evaluator().workcell.task.initial.reshape(1, -1)
-    result = Polisher(evaluator(), replace(SETTINGS, attempts=1)).polish(
+    result = make_polisher(evaluator(), replace(SETTINGS, attempts=1)).polish(
         one, np.random.default_rng(0)
     )
     assert np.any(np.all(result.objectives <= objectives_of(one)[0], axis=1))
@@ -198,7 +199,7 @@ def test_infeasible_points_are_no_front() -> None:
 
 
 def test_no_points_means_no_polish() -> None:
-    result = Polisher(evaluator(), PolishSettings(attempts=0)).polish(
+    result = make_polisher(evaluator(), PolishSettings(attempts=0)).polish(
         start_front(), np.random.default_rng(0)
     )
     assert result.outcomes == ()
@@ -207,7 +208,7 @@ def test_no_points_means_no_polish() -> None:
 
 @pytest.mark.slow
 def test_ipopt_finds_as_good_a_front() -> None:
-    result = Polisher(evaluator(), replace(SETTINGS, solver="ipopt")).polish(
+    result = make_polisher(evaluator(), replace(SETTINGS, solver="ipopt")).polish(
         start_front(), np.random.default_rng(0)
     )
     assert (polished().solver, result.solver) == ("dense", "ipopt")
@@ -219,7 +220,7 @@ def test_ipopt_finds_as_good_a_front() -> None:
 def test_other_objectives_are_refused() -> None:
     other = CandidateEvaluator(load(RACK), ("duration", "mean_force"))
     with refused(SettingsError, "objectives"):
-        Polisher(other, SETTINGS)
+        make_polisher(other, SETTINGS)
 
 
 class Broken(ForceSolver):
@@ -238,8 +239,8 @@ class Broken(ForceSolver):
 
 
 def test_a_broken_solver_loses_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(polisher_module, "ForceSolver", Broken)
-    polisher = Polisher(evaluator(), PolishSettings(attempts=9, rounds=1))
+    monkeypatch.setattr(force_front, "ForceSolver", Broken)
+    polisher = make_polisher(evaluator(), PolishSettings(attempts=9, rounds=1))
     result = polisher.polish(start_front(), np.random.default_rng(0))
     before = objectives_of(start_front())
     order = np.lexsort(before.T[::-1])

@@ -13,8 +13,9 @@ from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_OBJECTIVES
 from hybrid_opt.polishing.cell import CarryReader
+from hybrid_opt.polishing.front import Polisher
 from hybrid_opt.polishing.intervals import IntervalGrid, IntervalValues, PathTimingProgram
-from hybrid_opt.polishing.polisher import Polisher
+from hybrid_opt.polishing.polisher import make_polisher
 from hybrid_opt.polishing.rows import PathRow, Row
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.timing.model import TimingModel
@@ -184,7 +185,7 @@ FORK_FORCE = 80.0
 @pytest.fixture(scope="module")
 def fork() -> Iterator[Polisher]:
     cell = ho.Cell.load(RACK.with_name("fork.toml")).drivable()  # its files last as long
-    yield Polisher(cell.evaluator, PolishSettings())
+    yield make_polisher(cell.evaluator, PolishSettings())
     del cell
 
 
@@ -218,7 +219,7 @@ def rail(tmp_path_factory: pytest.TempPathFactory) -> Polisher:
     with them the robot's base, which moves, would touch what it stands on."""
     cell = without_obstacles(driven(rack_on_rail(tmp_path_factory.mktemp("rail"), 0.4, 0.25)))
     evaluator = CandidateEvaluator(cell, DRIVABLE_OBJECTIVES, compiled=CompiledCell(cell))
-    return Polisher(evaluator, PolishSettings())
+    return make_polisher(evaluator, PolishSettings())
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from hybrid_opt.evaluate.objectives import ROBUST_DRIVABLE_OBJECTIVES, ROBUST_OB
 from hybrid_opt.polishing.cell import CarryReader
 from hybrid_opt.polishing.force import ForceProgram, ForceSolver, balanced_scalarisation
 from hybrid_opt.polishing.intervals import IntervalGrid
-from hybrid_opt.polishing.polisher import Polisher
+from hybrid_opt.polishing.polisher import make_polisher
 from hybrid_opt.polishing.robust import GOVERNING_CASES, ROBUST_ROWS, RobustSamples
 from hybrid_opt.polishing.rows import ForceRow, Row
 from hybrid_opt.polishing.settings import PolishSettings
@@ -147,7 +147,7 @@ def test_robust_rows_bend_as_the_planned_force_that_rules() -> None:
 def test_a_point_is_driven_faster_within_robust_forces_and_believed() -> None:
     cell, force = unsure_rack(), 64.15
     evaluator = CandidateEvaluator(cell, ROBUST_DRIVABLE_OBJECTIVES, compiled=CompiledCell(cell))
-    drive_method = drive_method_of(Polisher(evaluator, PolishSettings(), functions()))
+    drive_method = drive_method_of(make_polisher(evaluator, PolishSettings(), functions()))
     driver = evaluator.driver
     assert driver is not None
     assert 60.0 < drive_method.force_limit[0] < 63.0

@@ -16,7 +16,7 @@ from hybrid_opt.carry import BoxMotion
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import REASONS, CandidateEvaluator, LockedEvaluator
 from hybrid_opt.evaluate.objectives import ROBUST_OBJECTIVES
-from hybrid_opt.polishing.polisher import Polisher
+from hybrid_opt.polishing.polisher import make_polisher
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.robust.force import RobustModel
 from hybrid_opt.robust.path_force import RobustPath
@@ -108,7 +108,7 @@ def test_robust_forces_keep_to_a_limit_and_hold_random_cases(cell: Cell) -> None
 def test_what_knows_closed_forms_only_refuses_it(cell: Cell) -> None:
     unsure = replace(cell.workcell, uncertainty=UNSURE)
     with refused(SettingsError, "not-polishable"):
-        Polisher(CandidateEvaluator(unsure, ROBUST_OBJECTIVES), PolishSettings())
+        make_polisher(CandidateEvaluator(unsure, ROBUST_OBJECTIVES), PolishSettings())
     with pytest.raises(SettingsError, match="opposite"):
         RobustPath(cell.workcell)
 
