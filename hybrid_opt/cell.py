@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from hybrid_opt.polishing.settings import PolishSettings
     from hybrid_opt.robust.budget import GripBudget
     from hybrid_opt.timing.model import TimingModel
-    from hybrid_opt.timing.path_timer import PathTimer
+    from hybrid_opt.timing.solve import PathTimer
 
 _EVALUATED_AT_ONCE = 500
 """Candidates evaluated at once; every sample of each is held in memory."""
@@ -222,7 +222,7 @@ class Cell:
     @cached_property
     def path_timer(self) -> PathTimer:
         """Compiled solver that computes the fastest timings of many paths."""
-        from hybrid_opt.timing.path_timer import PathTimer
+        from hybrid_opt.timing.solve import PathTimer
 
         return PathTimer(self.compiled, threads=self.threads)
 

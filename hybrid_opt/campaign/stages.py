@@ -377,7 +377,7 @@ class ReadyCell:
             workcell: the workcell, whose files exist during the call.
         """
         # Not imported at the top: other stages time nothing.
-        from hybrid_opt.timing.path_timer import search_carry, search_timing
+        from hybrid_opt.timing.candidates import search_carry, search_timing
 
         cell = Cell(workcell, objectives)
         cell.carry(cell.initial)
@@ -502,7 +502,7 @@ def _makers(cell: Cell, polish: bool) -> Iterator[Maker]:
     from hybrid_opt.polishing.drive import is_polishable
     from hybrid_opt.robust.force import robust_model
     from hybrid_opt.timing.model import TimingModel
-    from hybrid_opt.timing.path_timer import PATH_INTERVALS
+    from hybrid_opt.timing.solve import PATH_INTERVALS
 
     compiled, workcell = cell.compiled, cell.workcell
     driven = workcell.task.law.is_drivable

@@ -48,7 +48,7 @@ from symbolic.path.spline import extended_waypoints
 from symbolic.records import Workcell
 
 if TYPE_CHECKING:
-    from hybrid_opt.timing.path_timer import CandidateDriver
+    from hybrid_opt.timing.candidates import CandidateDriver
 
 
 COLLISION = "collision"
@@ -216,7 +216,8 @@ class CandidateEvaluator:
         if not self.workcell.task.law.is_drivable:
             return None
         # Not imported at the top: other time laws need no timing, and hence no CasADi.
-        from hybrid_opt.timing.path_timer import CandidateDriver, PathTimer
+        from hybrid_opt.timing.candidates import CandidateDriver
+        from hybrid_opt.timing.solve import PathTimer
 
         timer = PathTimer(self.compiled, threads=threads)
         return CandidateDriver(timer, threads, force_kind(self.objectives).robust)
@@ -248,7 +249,7 @@ class CandidateEvaluator:
         """Compute poses, joint positions, forces and all other outputs of
         `symbolic.functions.candidate_function` at the samples of candidates.
 
-        In drivable cells the outputs of `hybrid_opt.timing.path_timer.CandidateDriver.outputs` are
+        In drivable cells the outputs of `hybrid_opt.timing.candidates.CandidateDriver.outputs` are
         added.
 
         Args:

@@ -42,7 +42,7 @@ from hybrid_opt.polishing.solvers.quadratic import (
     solve_quadratic,
 )
 from hybrid_opt.robust.path_force import PathPoints, robust_path
-from hybrid_opt.timing.path_timer import CandidateDriver, TimedCandidate
+from hybrid_opt.timing.candidates import CandidateDriver, TimedCandidate
 from symbolic.array import Array
 from symbolic.contact.registry import command_model
 from symbolic.errors import SettingsError

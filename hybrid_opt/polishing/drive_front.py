@@ -31,8 +31,8 @@ from hybrid_opt.polishing.front import (
 from hybrid_opt.polishing.functions import PolishFunctions
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.polishing.starts import rotated_starts
+from hybrid_opt.timing.candidates import CandidateDriver
 from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.timing.path_timer import CandidateDriver
 from hybrid_opt.timing.solve import drive_path
 from symbolic.array import Array
 from symbolic.path.spline import coarse_task, resample_decisions

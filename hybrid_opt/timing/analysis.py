@@ -13,10 +13,10 @@ import numpy as np
 from hybrid_opt.carry import Carry
 from hybrid_opt.progress import ShowProgress, progress_bar
 from hybrid_opt.store.files import read_record
+from hybrid_opt.timing.candidates import search_carry, search_timing
 from hybrid_opt.timing.jerk import applicable_jerk_limits, time_with_jerk
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.passes import limit_place
-from hybrid_opt.timing.path_timer import search_carry, search_timing
 from hybrid_opt.timing.programs import duration_at_speed_limits
 from hybrid_opt.timing.records import (
     JerkTiming,

@@ -12,7 +12,7 @@ from hybrid_opt.carry import Carry
 from hybrid_opt.cell import Cell
 from hybrid_opt.evaluate.evaluation import REASONS
 from hybrid_opt.timing.analysis import check_search_timing
-from hybrid_opt.timing.path_timer import search_carry
+from hybrid_opt.timing.candidates import search_carry
 from hybrid_opt.timing.records import TimingStatus
 from symbolic.array import Array
 from symbolic.read.cell import load

@@ -33,8 +33,8 @@ from hybrid_opt.polishing.polisher import make_polisher
 from hybrid_opt.polishing.settings import PolishSettings
 from hybrid_opt.progress import Progress
 from hybrid_opt.robust.force import RobustModel, robust_model
+from hybrid_opt.timing.candidates import search_carry
 from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.timing.path_timer import search_carry
 from symbolic.cell_model import CellModel
 from symbolic.parameters import START
 from tests.refusals import refused

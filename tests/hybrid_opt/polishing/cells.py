@@ -17,8 +17,8 @@ from hybrid_opt.polishing.front import Polisher, Solution
 from hybrid_opt.polishing.functions import PolishFunctions, polish_functions
 from hybrid_opt.polishing.polisher import make_polisher
 from hybrid_opt.polishing.settings import DrivableSettings, PolishSettings
+from hybrid_opt.timing.candidates import CandidateDriver
 from hybrid_opt.timing.model import TimingModel
-from hybrid_opt.timing.path_timer import CandidateDriver
 from symbolic.array import Array
 from symbolic.read.cell import load
 from symbolic.records import Workcell

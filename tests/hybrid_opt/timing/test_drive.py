@@ -21,8 +21,9 @@ from hybrid_opt.evaluate.objectives import (
 from hybrid_opt.metaheuristics.run import CarryProblem
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.timing.analysis import drivable_timing
-from hybrid_opt.timing.path_timer import PATH_INTERVALS, CandidateDriver, PathTimer
+from hybrid_opt.timing.candidates import CandidateDriver
 from hybrid_opt.timing.records import TimingLimits, TimingStatus
+from hybrid_opt.timing.solve import PATH_INTERVALS, PathTimer
 from symbolic.array import Array
 from symbolic.functions import candidate_function
 from symbolic.geometry.clearance import screening_functions

@@ -10,9 +10,8 @@ import pytest
 from hybrid_opt.compiled_cell import CompiledCell
 from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.passes import ForwardBackwardPasses
-from hybrid_opt.timing.path_timer import PathTimer
 from hybrid_opt.timing.records import TimingLimits, TimingStatus
-from hybrid_opt.timing.solve import drive_path
+from hybrid_opt.timing.solve import PathTimer, drive_path
 from symbolic.array import Array
 from symbolic.errors import SettingsError
 from symbolic.read.cell import load

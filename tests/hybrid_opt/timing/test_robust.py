@@ -14,15 +14,15 @@ from hybrid_opt.robust.cases import worst_cases
 from hybrid_opt.robust.force import robust_model
 from hybrid_opt.static_hold import static_hold
 from hybrid_opt.timing.analysis import closest_to_reference_timing
+from hybrid_opt.timing.candidates import search_carry
 from hybrid_opt.timing.model import SpeedProfile, TimingModel
-from hybrid_opt.timing.path_timer import PathTimer, search_carry
 from hybrid_opt.timing.records import TimingLimits, TimingStatus
 from hybrid_opt.timing.robustness import (
     Margin,
     payload_sensitivity,
     robustness_margins,
 )
-from hybrid_opt.timing.solve import check_limits, drive_path, time_path
+from hybrid_opt.timing.solve import PathTimer, check_limits, drive_path, time_path
 from symbolic.contact.registry import command_model
 from symbolic.records import Uncertainty, Workcell
 from tests.hybrid_opt.timing import convex_oracle

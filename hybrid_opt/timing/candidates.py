@@ -1,17 +1,11 @@
-"""Fastest timings of many paths of one workcell, fast enough for a search; and timings of the
-candidates of drivable workcells, with a violation for each path that cannot be timed.
-
-No carry is built here; `hybrid_opt.timing.solve.drive_path` computes one from a timing. A candidate
-of a drivable workcell is a path and a force limit. Its timing is the fastest from rest to rest
-within this limit and all limits of robots, payload and contacts.
-"""
+"""Candidates of drivable workcells: a path and a force limit each. The timing of a candidate is the
+fastest from rest to rest within this limit and all limits of robots, payload and contacts; a path
+that cannot be timed has a violation."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -24,205 +18,10 @@ from hybrid_opt.carry import (
     Carry,
     carry_from_outputs,
 )
-from hybrid_opt.compiled_cell import CompiledCell
-from hybrid_opt.timing.model import TimingModel, require_intervals, sample_limits_set
-from hybrid_opt.timing.passes import ForwardBackwardPasses, failed_timing, path_failure
+from hybrid_opt.timing.model import TimingModel
 from hybrid_opt.timing.records import PathTiming, TimingLimits, TimingStatus
-from hybrid_opt.timing.solve import time_path
+from hybrid_opt.timing.solve import PathTimer
 from symbolic.array import Array
-from symbolic.errors import SettingsError
-from symbolic.records import Workcell
-
-if TYPE_CHECKING:
-    import casadi as ca
-
-    from symbolic.cell_model import CellModel
-
-PATH_INTERVALS = 100
-"""Number of intervals of constant path acceleration."""
-
-
-class PathTimer:
-    """Computes the fastest timings of paths of one workcell.
-
-    They are computed by a compiled backward and forward pass over the path. Limits that it does not
-    support are left to `time_path`, which is slow.
-
-    Attributes:
-        workcell: the workcell.
-        intervals: number of intervals of constant path acceleration.
-        passes: the compiled backward and forward pass.
-    """
-
-    def __init__(
-        self,
-        cell: Workcell | CompiledCell,
-        intervals: int = PATH_INTERVALS,
-        threads: int = 1,
-        lanes: int = 0,
-    ) -> None:
-        """Load or build the compiled functions.
-
-        Args:
-            cell: the workcell; give a compiled one to share its functions.
-            intervals: number of intervals of constant path acceleration.
-            threads: number of threads that share a batch.
-            lanes: number of paths that one vector instruction evaluates side by side; 0 for the
-                machine's width. One lane builds faster.
-
-        Raises:
-            SettingsError: the number of intervals is out of range.
-            DualArmError: the model or its code cannot be built.
-        """
-        require_intervals(intervals)
-        compiled = CompiledCell.of(cell)
-        self.workcell, self.intervals, self._threads = compiled.workcell, intervals, threads
-
-        def make(model: CellModel) -> dict[str, ca.Function]:
-            # Not imported at the top: a warm start needs no CasADi.
-            from symbolic.limit_coefficients import path_function
-
-            return {"path": path_function(model, 2 * intervals + 1)}
-
-        paths = compiled.functions("path", make, str(intervals), lanes=lanes, bodies=False)
-        self._path, self._limits = paths["path"], sample_limits_set(compiled, lanes)
-        self.passes = ForwardBackwardPasses(compiled, intervals, threads)
-        # Made here: the cell's files may be gone when the first path is timed.
-        has_all = self.passes.supports(TimingLimits(force=1.0, robust=True))
-        self._model = None if has_all else TimingModel(compiled, intervals)
-
-    def path_limits(self, x: Array) -> dict[str, Array]:
-        """Compute the geometry of n paths and the coefficients of their limits.
-
-        Args:
-            x: (n, n_path) free waypoints.
-
-        Returns:
-            Outputs of `symbolic.limit_coefficients.path_function` by name. The array `limits` is
-            added: (n, 2 intervals + 1, columns of `symbolic.limits.limit_layout`), coefficients at
-            both ends and in the middle of every interval.
-        """
-        # One path is not worth a second thread.
-        threads = self._threads if len(x) > 1 else 1
-        paths = self._path.batch(np.ascontiguousarray(x, dtype=float), threads=threads)
-        shapes = zip(self._limits.input_names, self._limits.input_shapes, strict=True)
-        samples = [paths[name].reshape(-1, *shape) for name, shape in shapes]
-        rows = self._limits.batch(*samples, threads=threads)["limits"]
-        return paths | {"limits": rows.reshape(len(x), 2 * self.intervals + 1, rows.shape[-1])}
-
-    def time(self, x: Array, limits: TimingLimits) -> PathTiming:
-        """Compute the fastest timing from rest to rest of one path.
-
-        Args:
-            x: (n_path,) free waypoints.
-            limits: limits in addition to the workcell's.
-
-        Raises:
-            SettingsError: x has the wrong shape or is not finite.
-        """
-        (timing,) = self.time_all(np.asarray(x, dtype=float)[None], limits)
-        return timing
-
-    def path_errors(self, paths: dict[str, Array]) -> list[PathTiming | None]:
-        """Find for each of n paths the error that rules out a timing.
-
-        Errors are: no motion, an arm that does not reach the box, joint limits, and manipulability.
-
-        Args:
-            paths: result of `path_limits`.
-
-        Returns:
-            For each path a record of the error, with infinite duration; None without an error.
-        """
-        names = ("lost", "limit_margin", "manipulability")
-        sides = [np.stack([paths[f"{name}_{arm}"] for arm in (1, 2)], axis=2) for name in names]
-        found = [
-            path_failure(self.workcell, pose[:, :6], *each)
-            for pose, *each in zip(paths["pose"], *sides, strict=True)
-        ]
-        return [
-            None if failure is None else failed_timing(*failure[:2], self.intervals)
-            for failure in found
-        ]
-
-    def time_all(
-        self,
-        x: Array,
-        limits: TimingLimits,
-        force: Array | None = None,
-        paths: dict[str, Array] | None = None,
-        path_errors: Sequence[PathTiming | None] | None = None,
-    ) -> list[PathTiming]:
-        """Compute the fastest timing from rest to rest of each of n paths.
-
-        Args:
-            x: (n, n_path) free waypoints.
-            limits: limits of all paths, in addition to the workcell's.
-            force: (n,) force limit of each path [N]; None for the force limit in `limits`.
-            paths: result of `path_limits`; computed if None.
-            path_errors: result of `path_errors`; computed if None.
-
-        Returns:
-            One record per path; without a timing it has infinite duration and states what failed.
-
-        Raises:
-            SettingsError: x has the wrong shape or is not finite, or a force limit is not positive.
-        """
-        x = np.ascontiguousarray(x, dtype=float)
-        (n_var,) = self._path.input_shapes[0]
-        if x.ndim != 2 or x.shape[1] != n_var or not np.isfinite(x).all():
-            raise SettingsError(
-                f"waypoints of shape {x.shape}; needs rows of {n_var} finite numbers", code="shape"
-            )
-        if force is not None and not ((force > 0.0) & (force < np.inf)).all():
-            raise SettingsError("force limits of paths: give finite positive forces", code="force")
-        paths = self.path_limits(x) if paths is None else paths
-        found = list(self.path_errors(paths) if path_errors is None else path_errors)
-        rows = [row for row, error in enumerate(found) if error is None]
-        if self._model is not None and not self.passes.supports(limits):
-            for row in rows:
-                own = limits if force is None else replace(limits, force=float(force[row]))
-                found[row] = _as_path_timing(self._model, x[row], own)
-        elif rows:
-            if len(rows) < len(x):
-                paths = {name: values[rows] for name, values in paths.items()}
-                force = None if force is None else force[rows]
-            for row, timing in zip(rows, self.passes.time(paths, limits, force), strict=True):
-                found[row] = timing
-        return [timing for timing in found if timing is not None]
-
-
-def _as_path_timing(model: TimingModel, x: Array, limits: TimingLimits) -> PathTiming:
-    """Time a path by `time_path` and convert the result to a `PathTiming`.
-
-    Args:
-        model: timing model of the workcell.
-        x: (n_path,) free waypoints.
-        limits: limits in addition to the workcell's.
-    """
-    timing = time_path(model, x, limits)
-    force, robust, carry = np.full(2, np.nan), None, timing.carry
-    if timing.status is TimingStatus.INFEASIBLE_AT_REST:
-        carry = model.still(model.path_motion(x))
-    if carry is not None:
-        force = carry.peak_normal_force
-        if limits.robust:
-            robust = model.carry_limits.limited_force(carry, limits).max(axis=0)
-    return PathTiming(
-        status=timing.status,
-        place=timing.place,
-        duration=timing.duration,
-        peak_force=force,
-        use={name: used.ratio for name, used in timing.use.items()},
-        grid_speed=timing.grid_speed,
-        sweeps=timing.iterations,
-        slowed=timing.slowed,
-        robust_force=robust,
-    )
-
-
-# --- candidates of drivable cells ---
-
 
 LEAST_FORCE_LIMIT = 1e-9
 """Least force limit of a candidate [N]: no timing has none."""
