@@ -41,9 +41,7 @@ from symbolic.records.task import initial_decision
 if TYPE_CHECKING:
     # Not imported at run time before they are needed: a search needs none of them.
     from hybrid_opt.collision.certify import Certificate
-    from hybrid_opt.polishing.front import Polisher
     from hybrid_opt.polishing.functions import PolishFunctions
-    from hybrid_opt.polishing.settings import PolishSettings
     from hybrid_opt.robust.budget import GripBudget
     from hybrid_opt.timing.model import TimingModel
     from hybrid_opt.timing.solve import PathTimer
@@ -90,7 +88,6 @@ class Cell:
         select_objectives(objectives)
         self._objectives = tuple(objectives)
         self._folder: TemporaryDirectory[str] | None = None  # of its files
-        self._polishers: dict[PolishSettings, Polisher] = {}
 
     def __reduce__(self) -> tuple[type[Cell], tuple[Any, ...]]:
         """Return what pickle needs to build the cell again in another process: constructor and
@@ -232,23 +229,6 @@ class Cell:
         from hybrid_opt.polishing.functions import polish_functions
 
         return polish_functions(self.compiled)
-
-    def polisher(self, settings: PolishSettings) -> Polisher:
-        """Return the polisher for fronts of this cell; the same settings return the same object.
-
-        Args:
-            settings: settings of the polish.
-
-        Raises:
-            SettingsError: the polish does not support the cell's objectives or pads.
-        """
-        # Not imported at the top: solvers take long to load.
-        from hybrid_opt.polishing.polisher import make_polisher
-
-        if settings not in self._polishers:
-            polisher = make_polisher(self.evaluator, settings, self.polish_functions)
-            self._polishers[settings] = polisher
-        return self._polishers[settings]
 
     @cached_property
     def grip_budget(self) -> GripBudget:

@@ -272,9 +272,12 @@ def polish(
     Raises:
         SettingsError: the polish does not support the cell's objectives, or a path does not fit.
     """
+    # Not imported at the top: solvers take long to load.
+    from hybrid_opt.polishing.polisher import make_polisher
+
     cell, task = front.cell, front.cell.workcell.task
     settings = settings or default_settings(task.law.is_drivable)
-    polisher = cell.polisher(settings)
+    polisher = make_polisher(cell.evaluator, settings, cell.polish_functions)
     known = [np.asarray(decision_of(path), dtype=float) for path in paths]
     if known and not task.law.is_drivable:
         raise SettingsError(

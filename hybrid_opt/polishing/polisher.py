@@ -4,6 +4,7 @@ together."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 from hybrid_opt.evaluate.evaluation import CandidateEvaluator
 from hybrid_opt.evaluate.objectives import DRIVABLE_PAIRS, FORCE_PAIRS, ROBUST_OBJECTIVES
@@ -30,12 +31,18 @@ def has_polishable_forces(workcell: Workcell, objectives: Sequence[str]) -> bool
     return command_model(workcell).has_scalar_squeeze or tuple(objectives) != ROBUST_OBJECTIVES
 
 
+CACHED_POLISHERS = 4
+"""Number of polishers that are kept for further fronts, because they load functions."""
+
+
+@lru_cache(maxsize=CACHED_POLISHERS)
 def make_polisher(
     evaluator: CandidateEvaluator,
     settings: PolishSettings,
     functions: PolishFunctions | None = None,
 ) -> Polisher:
     """Load or build the functions for the polish of an evaluator's cell, and return its polisher.
+    The same arguments return the same object.
 
     Args:
         evaluator: evaluator of candidates by the full model.
@@ -43,9 +50,9 @@ def make_polisher(
         functions: compiled functions of the cell; None loads or builds them.
 
     Raises:
-        SettingsError: the polish does not support the evaluator's objectives, or the cell's pads. It
-            needs both peak normal forces as objectives, in drivable cells the duration and one of
-            them. The forces may be planned or robust (holding the box in every case of the
+        SettingsError: the polish does not support the evaluator's objectives, or the cell's pads.
+            It needs both peak normal forces as objectives, in drivable cells the duration and one
+            of them. The forces may be planned or robust (holding the box in every case of the
             uncertainty).
         DualArmError: the functions cannot be built.
     """

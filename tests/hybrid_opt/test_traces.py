@@ -80,7 +80,7 @@ def search() -> ho.Front:
         (lambda: cell().evaluate(cell().initial), 5, 7),
         (lambda: ho.time_path(cell(), cell().initial, ho.TimingLimits(force=60.0)), 9, 11),
         pytest.param(search, 15, 12, marks=pytest.mark.slow),
-        pytest.param(lambda: polished.__wrapped__(), 26, 15, marks=pytest.mark.slow),
+        pytest.param(lambda: polished.__wrapped__(), 25, 15, marks=pytest.mark.slow),
         pytest.param(lambda: ho.recommend(polished()), 28, 15, marks=pytest.mark.slow),
     ],
 )
