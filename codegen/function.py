@@ -400,8 +400,15 @@ class PreparedBatch:
         return None if self._native is None else self._native()
 
     def __call__(self, count: int | None = None) -> dict[str, Array]:
-        """Evaluate the first `count` items of the batch, or all for None, and return the outputs by
-        name.
+        """Evaluate the first items of the batch and return the outputs by name.
+
+        Args:
+            count: number of items to evaluate, at most `size`; None for all.
+
+        Returns:
+            The arrays of the attribute `outputs` themselves, not copies, each (`size`, ...) with
+            the output's shape after `size`. The first `count` rows are new; the other rows keep
+            their earlier values. The next call overwrites them.
 
         Raises:
             CodegenError: the function failed, or the batch does not fit into memory.

@@ -6,9 +6,9 @@ ranked by the hypervolume of the carries that it has found so far; a pair withou
 by its least penalised objectives. All rounds of a pair form one search: each round begins with the
 pair's best candidates.
 
-In drivable cells pairs are compared under the time law 'ramped', from rest to rest. Which obstacles
-the arms hit and what they reach does not depend on the time law, and 'ramped' candidates are
-evaluated faster, several at a time.
+In drivable cells, whose carries are timed from rest to rest within all limits, pairs are compared
+under the time law 'ramped', from rest to rest. Which obstacles the arms hit and what they reach
+does not depend on the time law, and 'ramped' candidates are evaluated faster, several at a time.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ FORCE_LIMIT = "force_limit"
 JOINT_TORQUE = "joint_torque"
 NO_TIMING = "no_timing"
 DRIVE_CONSTRAINTS = (FORCE_LIMIT, JOINT_TORQUE, NO_TIMING)
-"""Constraints of drivable cells.
+"""Constraints of drivable cells, whose carries are timed from rest to rest within all limits.
 
 force_limit, joint_torque: holding the box at rest needs more than the limit allows; the violation
 is the needed value over the limit, minus 1.

@@ -178,10 +178,10 @@ class Cell:
     def drivable(self) -> Cell:
         """Return the drivable variant of the cell (docs/explanation/timing.md).
 
-        Carries of this variant have their fastest timing. The objectives are the duration and the
-        peak force; the force is the robust force if this cell minimises robust forces, else the
-        planned force. The new workcell file lies in a temporary folder that lasts as long as the
-        cell.
+        Carries of this variant are timed from rest to rest as fast as all limits of robots, payload
+        and pads allow. The objectives are the duration and the peak force; the force is the robust
+        force if this cell minimises robust forces, else the planned force. The new workcell file
+        lies in a temporary folder that lasts as long as the cell.
 
         Raises:
             BundleError: the workcell file cannot be changed, or was changed since it was read.

@@ -255,9 +255,10 @@ def polish(
 ) -> Front:
     """Improve the carries of a front by nonlinear programming and return the polished front.
 
-    The polish lowers both peak normal forces. In drivable cells it lowers duration and force
-    instead, by optimising path and speed profile together. It makes many attempts: solves from
-    different starts that improve points of the front or fill its gaps.
+    The polish lowers both peak normal forces. In drivable cells, whose carries are timed from rest
+    to rest within all limits, it lowers duration and force instead, by optimising path and speed
+    profile together. It makes many attempts: solves from different starts that improve points of
+    the front or fill its gaps.
 
     Args:
         front: the front to improve.
@@ -381,7 +382,8 @@ def select(
 def selected_row(evaluator: CandidateEvaluator, x: Array) -> int:
     """Return the index of the selected carry of a front.
 
-    The balanced carry is selected; in drivable cells, the knee of duration and larger peak force.
+    The balanced carry is selected. In drivable cells, whose carries are timed from rest to rest
+    within all limits, it is the knee of duration and larger peak force.
 
     Args:
         evaluator: evaluator of the cell's candidates.

@@ -42,15 +42,26 @@ def number(value: Any) -> Any:
 
 
 def sx_parameters(*records: Any) -> dict[str, ca.SX]:
-    """Return the symbolic parameters of records, one SX vector per parameter group, by name of the
-    group. Records of plain numbers have none."""
+    """Return the symbolic parameters of parts of a cell: one SX vector per parameter group, by name
+    of the group.
+
+    Args:
+        records: parts of the cell's description, such as task, robots and payload. A part with
+            symbols (`symbolic.records.numbered`) names its group; parts that name the same group
+            give one vector. A part of plain numbers gives none.
+    """
     groups = (group for record in records if (group := getattr(record, "given", None)) is not None)
     return {group.name: group.symbols for group in groups}
 
 
 def mx_parameters(*records: Any) -> dict[str, ca.MX]:
-    """Return a new MX vector for each parameter group of records, by name of the group. An MX
-    function takes these vectors as inputs and passes them to SX functions."""
+    """Return a new MX vector for each parameter group of parts of a cell, by name of the group. An
+    MX function takes these vectors as inputs and passes them to SX functions.
+
+    Args:
+        records: parts of the cell's description, as for `sx_parameters`. Parts that name the same
+            group give one vector.
+    """
     return mx_symbols(sx_parameters(*records))
 
 
@@ -65,7 +76,7 @@ def select_parameters(groups: Mapping[str, ca.MX], *records: Any) -> dict[str, c
 
     Args:
         groups: MX vectors by name of the parameter group.
-        records: records with symbols as parameters, or of plain numbers.
+        records: parts of the cell's description, as for `sx_parameters`.
     """
     return {name: groups[name] for name in sx_parameters(*records)}
 

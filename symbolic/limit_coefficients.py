@@ -1,7 +1,8 @@
 """Coefficients of the limits on the timing of a path, for the compiled passes and the polish.
 
 `symbolic.path_motion` gives a carry's geometry in physical quantities. Here every limit at a sample
-is a function of (u'', u'^2) with its coefficients packed in one vector.
+is a function of (u'', u'^2) with its coefficients packed in one vector. The path parameter u is in
+[0, 1], u' and u'' are its time derivatives; they are the timing at a sample.
 """
 
 from __future__ import annotations
@@ -177,13 +178,13 @@ def _contact_load(workcell: Workcell, blocks: dict[str, ca.SX], a: ca.SX, w: ca.
 
 
 def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
-    """Build the functions of both normal forces at one sample, and of their derivatives by the
-    timing.
+    """Build the functions of both normal forces at one sample, and of their derivatives by u'' and
+    u'^2, where u is the path parameter.
 
-    limit_forces takes sample (15,), the blocks force and moment of `limit_layout`; a = u''; w =
-    u'^2; then the payload's symbolic parameters. It returns the normal forces (2,) [N], which are
-    convex in a and w, and the solved variables (k,): results of Newton's method for soft fingers,
-    or the state of the convex program that finds the forces.
+    limit_forces takes sample (15,), the blocks force (9) and moment (6) of `limit_layout`; a = u'';
+    w = u'^2; then the payload's symbolic parameters. It returns the normal forces (2,) [N], which
+    are convex in a and w, and the solved variables (k,): results of Newton's method for soft
+    fingers, or the state of the convex program that finds the forces.
 
     limit_force_slopes takes the same inputs and the solved variables. It returns the forces (2,)
     and their derivatives (2,) by a and (2,) by w. Forces of a convex program are then those on its
@@ -216,11 +217,13 @@ def force_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
 
 def _load_function(workcell: Workcell) -> ca.Function:
     """Build the function of the load that the pads have to balance at one sample, and of its
-    derivatives by the timing.
+    derivatives by u'' and u'^2, where u is the path parameter.
 
-    Inputs: the blocks force and moment of `limit_layout` as one vector (15,), then u'', u'^2, and
-    the payload's parameters. Outputs: force and moment (6,) about the box frame's origin, along the
-    box's axes [N, N m]; and its derivatives (6, 2) by u'' and u'^2.
+    Inputs: vector (15,) of the blocks force (9) and moment (6) of `limit_layout`: the coefficients
+    of u'', u'^2 and 1 in the required force, and of u'' and u'^2 in the required moment; u''
+    [1/s^2]; u'^2 [1/s^2]; then the payload's symbolic parameters. Outputs: load (6,), force and
+    moment about the box frame's origin, along the box's axes [N, N m]; and the derivatives (6, 2)
+    of the load by u'' and by u'^2.
     """
     size = limit_layout(workcell).sizes["force"]
     payload = workcell.payload
@@ -238,7 +241,7 @@ def _load_function(workcell: Workcell) -> ca.Function:
 
 def path_force_function(workcell: Workcell) -> ca.Function:
     """Build the function of both normal forces at one point of a path, and of their derivatives by
-    the timing.
+    u'' and u'^2, where u is the path parameter.
 
     Inputs: pose, first, second (6,), the box pose and its first and second derivative by u; a =
     u''; w = u'^2; then the payload's symbolic parameters. Outputs: normal_force (2,) [N]; slope
@@ -270,7 +273,8 @@ def path_force_function(workcell: Workcell) -> ca.Function:
 
 def ratio_functions(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
     """Build the functions of joint torques and pressure shifts over their limits at one sample, and
-    of their derivatives by the timing. These limits are not convex in u'' and u'^2.
+    of their derivatives by u'' and u'^2, where u is the path parameter. These limits are not convex
+    in u'' and u'^2.
 
     Inputs of both: one vector, the blocks force, moment, torque and wrench of `limit_layout`; a =
     u''; w = u'^2; the payload's symbolic parameters; and the solved variables of `force_functions`.
@@ -375,13 +379,15 @@ def _program_ratios(workcell: Workcell) -> tuple[ca.Function, ca.Function]:
 
 
 def _inputs(workcell: Workcell, blocks: dict[str, ca.SX]) -> dict[str, ca.SX]:
-    """Return the inputs of the function `limit_forces` of `force_functions`, as symbols by name:
-    `sample`, the coefficients in `blocks`; a = u'' and w = u'^2 [1/s^2]; then the payload's
-    parameters.
+    """Return symbols of the inputs of `limit_forces` or, with more blocks, of `limit_ratios`.
+
+    By name, in the order of the inputs: `sample`, one column of all entries of `blocks`; `a`, u''
+    [1/s^2]; `w`, u'^2 [1/s^2]; then the payload's symbolic parameters. The path parameter is u.
 
     Args:
         workcell: the cell.
-        blocks: symbols of the blocks force (9,) and moment (6,) of `limit_layout`, by name.
+        blocks: symbols of blocks of `limit_layout` by name: force (9,) and moment (6,) for
+            `limit_forces`; also torque and wrench for `limit_ratios`.
     """
     timing = {name: ca.SX.sym(name) for name in ("a", "w")}
     return {"sample": ca.vertcat(*blocks.values())} | timing | sx_parameters(workcell.payload)

@@ -330,15 +330,19 @@ def _workcell(take: _Take, cell: Workcell) -> NumberedWorkcell:
 def _grasp(
     take: _Take, group: str, path: str, cell: Workcell, commanded: int | None
 ) -> GraspNumbers:
-    """Return the constants of the grasp of pads with any normals, in which every array is replaced
-    by a placeholder or a symbol. Their values are computed when they are first needed.
+    """Return the record of a grasp by pads with any normals in which `take` has replaced every
+    array of constants: by a placeholder (`Parameter`) or by symbols.
+
+    `take` gets the array's shape at once. The arrays' values, which cost a search for the internal
+    squeeze, are computed when the vector of the group is first asked for.
 
     Args:
-        take: replaces a parameter by a placeholder or a symbol.
+        take: replaces an array by a placeholder or by symbols.
         group: name of the parameter group.
         path: first part of the parameters' key paths.
-        cell: description of the cell.
-        commanded: index of the robot whose force is commanded; None for planned forces.
+        cell: description of the cell, from which the constants follow.
+        commanded: index of the robot whose commanded force the grasp serves (`GraspSqueeze`); None
+            for the grasp of planned forces (`Grasp`).
     """
 
     @cache

@@ -181,8 +181,9 @@ class CampaignResults:
     def to_polish(self) -> tuple[Front, ...]:
         """Fronts from which the polish starts.
 
-        These are the fronts of all replicas. For a drivable cell it is a single front, called
-        `UNION`, of the non-dominated candidates of all replicas together.
+        These are the fronts of all replicas. For a drivable cell, whose carries are timed from rest
+        to rest within all limits, it is a single front, called `UNION`, of the non-dominated
+        candidates of all replicas together.
         """
         if not self.workcell.task.law.is_drivable:
             return self.searched

@@ -392,7 +392,8 @@ Cells = tuple[tuple[CellFiles, tuple[str, ...]], ...]
 
 
 def cells_of(files: CellFiles, objectives: tuple[str, ...], driven: bool) -> Cells:
-    """Return the files and objectives of an experiment's cell and of its drivable variant.
+    """Return the files and objectives of an experiment's cell and of its drivable variant, in which
+    carries are timed from rest to rest within all limits.
 
     The contact models of the two may differ.
 

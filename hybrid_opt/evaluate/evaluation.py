@@ -155,7 +155,8 @@ class CandidateEvaluator:
         functions: the compiled functions by name.
         checker: collision checker of the workcell.
         n_var, lower, upper: size and bounds of the decision vector.
-        driver: timer of the candidates of a drivable cell, else None.
+        driver: timer of the candidates of a drivable cell (whose carries are timed from rest to
+            rest within all limits), else None.
         threads: number of threads that share a batch.
     """
 
@@ -175,7 +176,8 @@ class CandidateEvaluator:
             objectives: objectives to be minimised, by name or as `Objective` records.
             threads: number of threads that share a batch.
             functions: compiled functions of `symbolic.functions` by name; loaded or built if None.
-            driver: timer of the candidates of a drivable cell; built if None.
+            driver: timer of the candidates of a drivable cell, whose carries are timed from rest to
+                rest within all limits; None to build it. Other cells have none.
             compiled: the workcell with its compiled functions, to share them; created if None.
 
         Raises:
@@ -249,8 +251,8 @@ class CandidateEvaluator:
         """Compute poses, joint positions, forces and all other outputs of
         `symbolic.functions.candidate_function` at the samples of candidates.
 
-        In drivable cells the outputs of `hybrid_opt.timing.candidates.CandidateDriver.outputs` are
-        added.
+        In drivable cells, whose carries are timed from rest to rest within all limits, the outputs
+        of `hybrid_opt.timing.candidates.CandidateDriver.outputs` are added.
 
         Args:
             x: (n, n_var) decision vectors.

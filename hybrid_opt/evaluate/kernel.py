@@ -6,7 +6,8 @@ distance. For pairs that the bound leaves open Coal tries a proof; FCL decides t
 per sample are returned only on request.
 
 `evaluate_numpy` computes the same in NumPy from the outputs of the candidate function. It is the
-reference of the kernel, and evaluates the candidates of drivable cells.
+reference of the kernel, and evaluates the candidates of drivable cells, whose carries are timed
+from rest to rest within all limits.
 """
 
 from __future__ import annotations

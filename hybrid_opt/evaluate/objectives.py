@@ -60,6 +60,8 @@ FORCE_PAIRS = (PAPER_OBJECTIVES, ROBUST_OBJECTIVES)
 class ForceKind:
     """Kind of normal force that is limited and minimised in drivable carries: planned or robust.
 
+    Drivable carries, those of drivable cells, are timed from rest to rest within all limits.
+
     Attributes:
         robust: whether the force holds the box in every case of the workcell's uncertainty.
         drivable: names of the two objectives of drivable cells: duration and largest force.
@@ -294,7 +296,8 @@ _ROBUST = tuple(OBJECTIVES[name].evaluate for name in ("robust_force", *ROBUST_O
 
 
 def force_kind(objectives: Sequence[str | Objective]) -> ForceKind:
-    """Return the kind of force that drivable cells limit.
+    """Return the kind of force that drivable cells limit: cells whose carries are timed from rest
+    to rest within all limits.
 
     It is the robust force, which holds the box in every case of the uncertainty, if an objective
     minimises a robust force. Otherwise it is the planned force, which holds the box if everything

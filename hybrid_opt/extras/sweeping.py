@@ -132,7 +132,8 @@ def sweep(
     of a cell.
 
     Args:
-        cell: drivable cell, see `Cell.drivable`.
+        cell: drivable cell, whose carries are timed from rest to rest within all limits
+            (`Cell.drivable`).
         path: good carry of the cell, such as the recommended one, or the carry's decision vector.
         over: values to combine, by key path as for `Cell.changed`.
         fixed: True to keep the path and to choose only its force limit anew; False to polish the
@@ -320,16 +321,21 @@ def _row(
 
 
 def _tried(cell: Cell, near: Sequence[Array], fixed: bool) -> Evaluations:
-    """Evaluate paths in a changed cell, each with the force limit of the least product of duration
-    and commanded force.
+    """Evaluate paths in a changed cell, each with the best of several force limits.
 
-    If no path keeps the robots' reference forces with any limit, the limits with the least
-    commanded forces are taken.
+    A limit is admissible for a path if the robust force of each robot is then at most the robot's
+    reference force. The admissible limit with the least product of duration and commanded force is
+    taken; a path without an admissible limit is left out. If no path has one, every path that can
+    be timed is evaluated, with the limit of the least commanded force.
 
     Args:
         cell: the changed cell.
-        near: decision vectors (n_var,) of the paths.
+        near: decision vectors (n_var,) of the paths; their own force limits are not used.
         fixed: True to evaluate only these paths; False to evaluate the hand-made path too.
+
+    Returns:
+        Evaluations of the paths. The members of their feasible front are certified between the
+        samples.
     """
     x = np.array([x[:-1] for x in (near if fixed else [*near, cell.initial])])
     paths = DrivenPaths(cell, x)

@@ -224,9 +224,10 @@ class CarryProblem(Problem):  # type: ignore[misc]
             evaluator: evaluator of the candidates.
             handling: 'penalty' or 'constraints', see the class.
             evaluated: function called after each batch with the number of candidates in the batch.
-            task: task of the evaluator. If it has intermediate waypoints beside those of the
-                workcell file, pymoo varies only the latter, and the intermediate ones lie on the
-                path through them. None to vary all variables of the evaluator.
+            task: task of the evaluator. If `Task.pieces` added intermediate waypoints to those of
+                the workcell file, pymoo varies only the waypoints of the file; the intermediate
+                waypoints lie on the path through the waypoints of the file. None to vary all
+                variables of the evaluator.
         """
         self.task = task if task is not None and task.pieces > 1 else None
         self.drawn = None if self.task is None else coarse_task(self.task)
@@ -386,8 +387,8 @@ def search_carries(
     evaluated: Callable[[int], None] = lambda count: None,
     task: Task | None = None,
 ) -> tuple[Evaluations, NDArray[np.intp]]:
-    """Search with an exact number of evaluations, and certify the front of all evaluated
-    candidates.
+    """Search with an exact number of evaluations, then certify the members of the feasible front of
+    all evaluated candidates: prove that they do not collide between samples either.
 
     Args:
         evaluator: evaluator of the candidates.
@@ -396,12 +397,15 @@ def search_carries(
         rng: random generator of the whole run.
         settings: settings of the search.
         evaluated: function called after each batch with the number of candidates in the batch.
-        task: task of the evaluator. If it has intermediate waypoints beside those of the workcell
-            file, the search varies only the latter, and the intermediate ones lie on the path
-            through them. None to vary all variables of the evaluator.
+        task: task of the evaluator. If `Task.pieces` added intermediate waypoints to those of the
+            workcell file, the search varies only the waypoints of the file; the intermediate
+            waypoints lie on the path through the waypoints of the file. None to vary all variables
+            of the evaluator.
 
     Returns:
-        The evaluations of all candidates in order, and the generation (n,) of each, from 1.
+        The evaluations of all candidates in order, and the generation (n,) of each, from 1. In the
+        evaluations a member of the front without a proof is infeasible, for the reason
+        `BETWEEN_SAMPLES`; every member of the front that remains is proven.
 
     Raises:
         SettingsError: an unknown algorithm or a value that is not allowed.

@@ -203,7 +203,8 @@ class PlacedCarry:
             allowed value.
         split: (n, 2) two quantities [N] from which the normal forces follow: for soft fingers both
             normal forces, else normal component and tangential magnitude of the required force.
-            Undefined in drivable cells and if the pads do not face each other.
+            Undefined if the pads do not face each other, and in drivable cells, whose carries are
+            timed from rest to rest within all limits.
         force: (n, 2) normal forces that are minimised, planned or robust [N].
         peak: (2,) largest of these forces of each robot over its reference force.
         shift: (n, 2) shifts of the centres of pressure over the patch radii.

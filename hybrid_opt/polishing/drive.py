@@ -218,8 +218,9 @@ class DriveStepMethod(StepMethod[DriveIterate, DriveStep]):
                 intermediate waypoints too.
 
         Raises:
-            SettingsError: the cell is not drivable, or its force limit applies to robust normal
-                forces and its pads do not face each other.
+            SettingsError: the cell is not drivable (its carries are not timed from rest to rest
+                within all limits), or its force limit applies to robust normal forces and its pads
+                do not face each other.
         """
         driver, task = cell.evaluator.driver, cell.task
         if driver is None or not is_polishable(cell.workcell, driver.robust):

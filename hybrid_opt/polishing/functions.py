@@ -55,9 +55,9 @@ class PolishFunctions:
 
     Attributes:
         built: the functions by name, described in `symbolic.smooth`: forces and pressure at
-            samples, inverse kinematics of both arms, in drivable cells limits along a driven path,
-            and constraints at points of the path. Functions for other constraints are added on
-            first use.
+            samples, inverse kinematics of both arms, in drivable cells (carries are timed from rest
+            to rest within all limits) limits along a driven path, and constraints at points of the
+            path. Functions for other constraints are added on first use.
         closure: `closure(arm, order)` returns the function from the box pose to the joint positions
             of an arm, with first or second derivatives, see `symbolic.smooth.path_points`.
         row: `row(constraint, order)` returns the function of a constraint at a point, with first or
@@ -110,7 +110,8 @@ def sample_quantities(workcell: Workcell) -> tuple[Quantity, ...]:
     - 'load': force and moment that the box needs. Pads whose forces have no closed form have it in
       place of the others; a convex program computes their forces from it.
 
-    Drivable cells have none, because their limits apply at the intervals of the timing.
+    Drivable cells, whose carries are timed from rest to rest within all limits, have none: their
+    limits apply at the intervals of the timing.
 
     Args:
         workcell: the cell.

@@ -44,16 +44,20 @@ def make_polisher(
     """Load or build the functions for the polish of an evaluator's cell, and return its polisher.
     The same arguments return the same object.
 
+    The objectives have to be both peak normal forces. In drivable cells, whose carries are timed
+    from rest to rest within all limits, they have to be the duration and the largest force. The
+    forces may be planned or robust (holding the box in every case of the uncertainty). Robust
+    forces of pads whose normals are not opposite are not supported; planned forces are, with any
+    pads.
+
     Args:
         evaluator: evaluator of candidates by the full model.
         settings: settings of the polish.
         functions: compiled functions of the cell; None loads or builds them.
 
     Raises:
-        SettingsError: the polish does not support the evaluator's objectives, or the cell's pads.
-            It needs both peak normal forces as objectives, in drivable cells the duration and one
-            of them. The forces may be planned or robust (holding the box in every case of the
-            uncertainty).
+        SettingsError: the polish does not support the evaluator's objectives, or their forces with
+            the cell's pads.
         DualArmError: the functions cannot be built.
     """
     driven = evaluator.workcell.task.law.is_drivable

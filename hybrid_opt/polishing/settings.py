@@ -67,7 +67,8 @@ class FillSettings:
 
 @dataclass(frozen=True)
 class DrivableSettings:
-    """Settings of the polish of drivable cells (`hybrid_opt.polishing.drive_front`).
+    """Settings of the polish of drivable cells (`hybrid_opt.polishing.drive_front`). Their carries
+    are timed from rest to rest within all limits.
 
     Attributes:
         first_rounds: largest number of trust-region iterations for the first path.
@@ -100,7 +101,8 @@ class PolishSettings:
             samples.
         probe: settings of the search for basins far from the front.
         fill: settings of the filling of the front between its ends.
-        drivable: settings of the polish of drivable cells.
+        drivable: settings of the polish of drivable cells, whose carries are timed from rest to
+            rest within all limits.
     """
 
     attempts: NumberOrNone = 8
@@ -120,7 +122,8 @@ def default_settings(is_drivable: bool) -> PolishSettings:
     """Return the settings of a full study.
 
     Args:
-        is_drivable: True for a drivable cell.
+        is_drivable: True for a drivable cell: its carries are timed from rest to rest within all
+            limits.
     """
     return PolishSettings(attempts=DRIVABLE_ATTEMPTS) if is_drivable else PolishSettings()
 
@@ -129,7 +132,8 @@ def quick_settings(is_drivable: bool) -> PolishSettings:
     """Return the settings of a small study: a third as many points from fewer attempts.
 
     Args:
-        is_drivable: True for a drivable cell.
+        is_drivable: True for a drivable cell: its carries are timed from rest to rest within all
+            limits.
     """
     if is_drivable:
         return PolishSettings(

@@ -141,7 +141,7 @@ def advice(cell: Cell, paths: DrivenPaths, option: Option, timing: Timing) -> tu
     decrease of the commanded force first.
 
     Args:
-        cell: the drivable cell.
+        cell: the drivable cell: its carries are timed from rest to rest within all limits.
         paths: paths of the front.
         option: path and force limit of the recommended carry.
         timing: timing of the recommended carry.

@@ -220,7 +220,8 @@ def force_alone(duration: float, force: float) -> float:
 class DrivenPaths:
     """Paths of one drivable cell, with stored geometry, to be timed repeatedly within force limits.
 
-    A timing satisfies all limits of the cell's drivable carries except those on jerk.
+    The carries of a drivable cell are timed from rest to rest within all limits of robots, payload
+    and pads. The timings here satisfy all of them except those on jerk.
 
     Attributes:
         x: (k, n_path) decision vectors of k paths, without the force limit.
@@ -420,7 +421,7 @@ def gentle_start(cell: Cell) -> Array:
     force is taken.
 
     Args:
-        cell: drivable cell.
+        cell: drivable cell: its carries are timed from rest to rest within all limits.
     """
     paths = DrivenPaths(cell, cell.initial[:-1])
     options = paths.all_options(float(cell.initial[-1]))

@@ -191,7 +191,8 @@ def recommend(
     necessary changes of the cell.
 
     Args:
-        front: front of a drivable cell, see `Cell.drivable`.
+        front: front of a drivable cell, whose carries are timed from rest to rest within all limits
+            (`Cell.drivable`).
         wish: another target, or numbers that replace the cell's; None for the default target.
         others: further paths (n_path,) by label, to compare with the recommended carry; the
             hand-made path is always compared. None for no further paths.
@@ -507,7 +508,7 @@ def time_alternative(
     commanded force, and its least commanded force within the carry's duration.
 
     Args:
-        cell: drivable cell.
+        cell: drivable cell: its carries are timed from rest to rest within all limits.
         label: name of the path.
         path: (n_path,) decision vector of the path, without a force limit.
         timing: timing of the recommended carry.

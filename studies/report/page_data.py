@@ -442,10 +442,16 @@ def _search_groups(data: ReportData, paper: bool) -> Iterator[MeshGroup]:
 
 
 def _traces(groups: Sequence[Numbered], found: Sequence[dict[str, Any]]) -> Iterator[Plot]:
-    """Yield a plotly trace for each group of trajectories that has a marker.
+    """Yield a plotly trace for each group of trajectories that has a marker: one point per
+    trajectory, which shows the trajectory when it is clicked.
+
+    A point lies at the coordinates that the group states. If it states none, the point lies at
+    commanded force [N] and duration [s] of the trajectory as robots drive it. Trajectories without
+    a commanded force then have no point, and symbols are open where this force exceeds the
+    reference force. A line joins the points if `MeshGroup.joined` is True.
 
     Args:
-        groups: pairs of a group and the numbers of its trajectories on the page.
+        groups: pairs of a group and the indices of its trajectories on the page.
         found: JSON values of all trajectories of the page, by number.
     """
     for group, members in groups:

@@ -173,7 +173,8 @@ def commanded_forces(
             tangents [m].
         groups: MX vectors in place of the convex program's symbolic parameters, by group; None if
             it has none.
-        differentiable: True for exact first derivatives.
+        differentiable: True for exact first derivatives; False if only values are needed, because
+            derivatives of the expression are then not exact.
     """
     groups = groups or {}
     reach = share / as_mx(ca.SX(number(squeeze.numbers.reach)), squeeze.given, groups)
@@ -220,13 +221,19 @@ def commanded_slack(
 
 
 def internal_force_gain(squeeze: GraspSqueeze) -> ca.Function:
-    """Build the function of the additional commanded force that is needed per newton of an internal
-    force with which the arms push against each other.
+    """Build the function of the additional commanded normal force that is needed per newton of a
+    tangential force with which the arms push against each other.
 
-    The internal force is a tangential force at any one of the pads. Friction has to bear it, so the
-    pads press harder. Inputs: friction coefficients (2,) and relative patch sizes (2,) of the
-    robots, then the symbolic parameters. Output: the additional commanded force over the internal
-    force, a scalar.
+    The tangential force may act at any single pad. Friction has to bear it there, so the internal
+    squeeze, pad forces that balance one another, has to be larger. The result is for the pad at
+    which the squeeze has to grow most.
+
+    Inputs: friction (2,), Coulomb coefficients of the robots' pads; share (2,), sizes of the
+    robots' patches over the cell's own sizes; then the symbolic parameters. Output: additional
+    normal force of the commanded robot over the tangential force [N/N], a scalar.
+
+    Args:
+        squeeze: convex program, which knows the commanded robot.
     """
     friction, share = ca.SX.sym("friction", 2), ca.SX.sym("share", 2)
     given = squeeze.squeeze_states(friction, share / squeeze.numbers.reach)

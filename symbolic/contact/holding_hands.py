@@ -465,9 +465,10 @@ class HoldingHands(ContactModel):
 
     @property
     def own_changes(self) -> dict[str, Callable[[Contact], Contact]]:
-        """Changes of the contacts that an advice to the user may propose, as functions by the text
-        of the advice. If all hands are cups, this is one change: a larger cup at the same vacuum,
-        whose `strength` is higher. Otherwise the dictionary is empty."""
+        """Changes of the contacts that may be proposed to the user. If all hands are cups, this is
+        one change: a larger cup at the same vacuum, whose `strength` is higher. Otherwise there are
+        none. Keys are texts of the changes, values are functions that take a contact and return its
+        changed copy."""
         if any(contact.kind != "cup" for contact in self.workcell.contacts):
             return {}
         return {f"cups {2e3 * LARGER_CUP:.0f} mm larger across at the same vacuum": larger_cup}

@@ -420,9 +420,9 @@ class ContactModel(ABC):
 
     @property
     def own_changes(self) -> dict[str, Callable[[Contact], Contact]]:
-        """Changes of the contacts that an advice to the user may propose for this contact model
-        only: functions from a contact to its changed copy, by the text of the advice. By default
-        there are none."""
+        """Changes of the contacts that may be proposed to the user with this contact model only; by
+        default none. Keys are texts of the changes, such as 'cups 10 mm larger across'. Values are
+        functions that take a contact and return its changed copy."""
         return {}
 
     # --- jobs ---

@@ -256,17 +256,23 @@ def _least_force(
     displaced: bool = False,
     beside: Expression | float = 0.0,
 ) -> Expression:
-    """Build the expression of the least commanded normal forces (2,) in one case of the uncertainty
-    [N].
+    """Build the expression of the least commanded normal forces (2,) of both robots [N] in one case
+    of the uncertainty.
+
+    Commanded with these forces, pads or hands hold the load of the case, although a share of each
+    force is missing and the arms push against each other, both as the case states.
+    With two opposite pads or hands, both forces are least. With `squeeze`, the force of the robot
+    `squeeze.commanded` is least, and the other robot's force results from it.
 
     Args:
         workcell: the workcell.
-        squeeze: convex program of pads at any normals; None for two pads with opposite normals and
-            for hands.
+        squeeze: convex program for pads with any normals; None for two pads with opposite normals
+            and for hands.
         inputs: symbols by name: pose, rate, second_rate (6,), case (18,), and parameters by group.
         implicit: stores the results of Newton's method, so that derivatives of the forces become
             exact; None if no derivatives are needed.
-        differentiable: True for exact first derivatives of the convex program's solution.
+        differentiable: True for exact first derivatives of the convex program's solution; False if
+            only values are needed. It has no effect without `squeeze`.
         displaced: True if cases include displacements of the pads; only for opposite normals.
         beside: further force and moment (6,) that is added to the load of the case, about the box
             frame's origin [N, N m], for derivatives by the load; only with `squeeze`.
@@ -353,14 +359,18 @@ def _commanded_by_program(
     groups: dict[str, ca.MX],
     differentiable: bool = False,
 ) -> ca.MX:
-    """Build the expression of the normal forces (2,) to command [N] for pads with any normals.
+    """Build the expression of the normal forces (2,) of both robots [N] for pads with any normals:
+    the least force to command to one robot in one case of the uncertainty, and the other robot's
+    force that results from it. They hold the load although a share of the commanded force is
+    missing and the arms push against each other, both as the case states.
 
     Args:
-        squeeze: convex program of the least commanded force.
+        squeeze: convex program of the least commanded force, which knows the commanded robot.
         load: (6,) force and moment about the box frame's origin, along the box's axes [N, N m].
         case: (18,) case of the uncertainty, laid out by `CASE_SIZES`.
         groups: MX vectors of the cell's parameters, by name of the parameter group.
-        differentiable: True for exact first derivatives.
+        differentiable: True for exact first derivatives; False if only values are needed, because
+            derivatives of the expression are then not exact.
     """
     friction, *_, displacement, tracking, internal = case_parts(case)
     commanded, given = squeeze.commanded, list(groups.values())

@@ -107,10 +107,12 @@ class CellGeometry:
 
     @cached_property
     def blocks(self) -> Mapping[str, range]:
-        """Ranges of indices of the possible pairs; one compiled function bounds the distances of a
-        range.
+        """Division of the pairs in `possible` into at most two blocks, each with compiled functions
+        of its own, such as the one of lower bounds of the distances.
 
-        The key is the prefix of the function's name: '' for near pairs, `FAR` for all other pairs.
+        A key is the prefix of these functions' names, a value the range of the block's indices in
+        `possible`. The block '' has the near pairs, which are the first `near` ones. The block
+        `FAR` has the others; it is missing if there are none.
         """
         far = range(self.near, len(self.possible))
         return {"": range(self.near)} | ({FAR: far} if far else {})

@@ -70,11 +70,13 @@ class ImportedScene:
     files: Mapping[str, bytes]
 
     def tables(self, folder: Path, meshes: Path) -> list[dict[str, Any]]:
-        """Return the scene as `[[environment]]` tables of a workcell file.
+        """Return the bodies as `[[environment]]` tables of a workcell file, one per body.
+
+        No file is written; the caller stores the scene's embedded meshes (the attribute `files`).
 
         Args:
-            folder: folder of the workcell file, to which mesh paths are relative.
-            meshes: folder to which the scene's mesh files (the attribute `files`) are written.
+            folder: folder of the workcell file, to which mesh paths in the tables are relative.
+            meshes: folder in which the caller stores the contents of `files` under their names.
         """
         return [_table(body, folder, meshes) for body in self.bodies]
 

@@ -182,11 +182,14 @@ def grasp_force_functions(
 
 def motion_function(task: Task) -> ca.Function:
     """Build the function of the box motion at all n samples and its derivatives by the decision
-    vector.
+    vector, with the time law `constant` or `ramped`.
 
-    Input: x (n_var,). Outputs (NumPy shapes): motion (n, 18), the box pose (6,), its rate and its
-    second rate at each sample; slope (18 n, n_var), the derivatives of motion's entries, row by
-    row.
+    Input: x (n_var,), the decision vector. Outputs (NumPy shapes): motion (n, 18), at each sample
+    the box pose (6,) [m, rad] and its first [m/s, rad/s] and second [m/s^2, rad/s^2] derivative by
+    time; slope (18 n, n_var), the derivatives of the entries of motion by x, sample by sample.
+
+    Args:
+        task: task of the cell.
     """
     x = ca.MX.sym("x", task.n_var)
     path = timed_path(task, sample_basis(task), waypoint_matrix(task, x))

@@ -118,7 +118,7 @@ def gap_of(sampled: SampledJob, interpolation: Interpolation, stiffness: float) 
     a job, while they hold the box, and the force error that follows.
 
     Args:
-        sampled: the job at the time steps of a target.
+        sampled: the job at the time steps of a bundle.
         interpolation: how the controller interpolates between samples.
         stiffness: stiffness of each arm at its pad along the normal [N/m].
     """
@@ -242,7 +242,8 @@ class BundleOptions:
         any_arm: True to write a maker's own language also for arms that do not look like this
             maker's.
         stiffness: stiffness of each arm at its pad along the normal [N/m]; None for the value that
-            the workcell states, or that follows from the target's gains.
+            the workcell states, or that follows from the gains of the bundle's target (a driver or
+            language of robots, such as `ur-script`).
         skew: delay between the starts of both arms during which friction has to hold the box [s];
             None for the usual delay of the target.
         addresses: host names or IP addresses of both controllers; None for those in the workcell.
@@ -266,7 +267,7 @@ class Export:
     """A job with all data from which the files of a bundle are written.
 
     Attributes:
-        sampled: the job at the target's time steps.
+        sampled: the job at the time steps of the bundle.
         stiffness: stiffness of each arm at its pad along the normal [N/m]; None if nothing depends
             on it.
         gap: error of the pads between samples; None without a stiffness.

@@ -212,27 +212,30 @@ LEAST_LIKENESS = 0.5
 """Least correlation of two signals' rates with which one counts as the delayed other."""
 
 CLEARER = 1.05
-"""Least ratio of the difference of two signals without the delay to the difference with it. Noise
-alone reaches 1.04."""
+"""Least ratio of 1 - correlation without a delay to 1 - correlation with the delay that was found.
+Noise alone reaches 1.04."""
 
 
 def delay(
     time: Array, first: Array, second: Array, most: float = 1.0, apart: float | None = None
 ) -> float | None:
-    """Estimate the delay of one signal relative to another [s].
+    """Estimate the delay of one signal relative to another [s], by the correlation of their time
+    derivatives.
 
     Args:
         time: (n,) times of the samples [s].
         first: (n,) the reference signal, in any unit.
         second: (n,) the delayed signal, in any unit.
         most: largest magnitude of the delay that is considered [s].
-        apart: delays up to this magnitude [s] have to correlate clearly less than the result; None
-            to skip this comparison.
+        apart: largest magnitude of a delay that counts as none [s]. Signals that fit nearly as well
+            with such a delay give None, so that noise alone does not appear as a delay. None to
+            accept every delay.
 
     Returns:
-        Delay with the largest correlation of the signals' time derivatives; negative if `second` is
-        ahead of `first`. None if the signals are too short, if the correlation is weak, or if a
-        delay up to `apart` correlates nearly as well.
+        Delay with the largest correlation; negative if `second` is ahead of `first`. None if the
+        signals are too short or too long, if the largest correlation is below `LEAST_LIKENESS`, or
+        if the best delay is itself at most `apart`. Also None if it is hardly better than a delay
+        up to `apart`: if 1 - correlation is smaller by less than the factor `CLEARER`.
     """
     wide = round(SMOOTHED / GRID_STEP)
     if not 4 * wide < (time[-1] - time[0]) / GRID_STEP < LARGEST_GRID:

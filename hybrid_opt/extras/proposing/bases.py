@@ -145,8 +145,13 @@ def _scored(
 
 
 def draft_of(problem: Problem) -> Workcell:
-    """Build the workcell of a problem with provisional robot bases and automatically chosen
-    redundant joints.
+    """Build a provisional workcell of a problem whose bases are still to be found: the search for
+    bases needs its arms, payload and obstacles.
+
+    Each robot stands 0.4 m from the mean of its contact's positions at start and goal, away from
+    the carry, and faces the carry. Both arms of a two-armed machine get the mean of these two
+    bases. The redundant joints of arms with more than six joints are those of the file, or are
+    chosen.
 
     Args:
         problem: the problem, with contacts.

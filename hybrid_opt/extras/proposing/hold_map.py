@@ -101,7 +101,7 @@ class HeldPose:
 @dataclass(frozen=True, eq=False)
 class HoldMap:
     """Map of the box poses that both arms can hold at once, on a grid of heights (l), positions (y
-    and x) and directions (w) of the box.
+    and x) and directions (w) of the box. A direction is a rotation about the vertical.
 
     Attributes:
         geometry: bodies of the cell.
@@ -114,8 +114,7 @@ class HoldMap:
         spins: (l, ny, nx, w, 2) rotation of each pad about its normal, in addition to the file's
             [rad]; NaN where the box cannot be held.
         q: joint positions (l, ny, nx, w, joints) of each arm [rad or m]; NaN where the box cannot
-            be
-        held.
+            be held.
         comfort: (l, ny, nx, w) of the less comfortable arm, from 0, at a joint limit and a singular
             posture, to 1, far from both; NaN where the box cannot be held.
     """
@@ -155,10 +154,11 @@ class HoldMap:
 
     @cached_property
     def _quality(self) -> Array:
-        """(l, ny, nx, w) quality of box poses, by height, y, x and direction.
+        """(l, ny, nx, w) quality of box poses, by height, y, x and rotation about the vertical.
 
-        It is the comfort of the postures times the distance, in grid steps, to the nearest position
-        at the same height at which the box cannot be held in the same direction; 0 at poses that
+        It is the comfort of the postures times the distance of the box centre, in grid steps, from
+        the nearest position at the same height at which the box, with the same rotation, cannot be
+        held; 0 at poses that cannot be held. Positions beyond the grid count as ones at which it
         cannot be held.
         """
         inside = np.pad(self.holds, ((0, 0), (1, 1), (1, 1), (0, 0)))
@@ -171,11 +171,12 @@ class HoldMap:
         """Return the best box pose that both arms can hold; None if there is none.
 
         It maximises the comfort of the postures (their distance from joint limits and singular
-        postures) times the distance to the nearest position at which the box cannot be held in the
-        same direction.
+        postures) times the distance of the box centre from the nearest position at the same height
+        at which the box, with the same rotation about the vertical, cannot be held. Positions
+        beyond the grid count as such.
 
         Args:
-            level: index of the height; None for all heights.
+            level: index of the height in `z`; None for all heights.
         """
         first = 0 if level is None else level
         quality = self._quality if level is None else self._quality[level : level + 1]

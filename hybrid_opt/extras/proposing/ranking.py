@@ -17,10 +17,11 @@ from symbolic.errors import DualArmError
 
 
 def fastest_carry(cell: Cell, evaluations: int, rng: np.random.Generator) -> Carry:
-    """Find the fastest carry of a drivable cell by a small study: one search and one polish.
+    """Find the fastest carry of a cell's drivable variant, in which carries are timed from rest to
+    rest within all limits, by a small study: one search and one polish.
 
     Args:
-        cell: the cell.
+        cell: the cell, drivable or not.
         evaluations: number of candidates of the search.
         rng: generator of all random numbers.
 

@@ -200,10 +200,11 @@ def _connected(
 
 
 def _shortened(lines: _Lines, corners: list[Array]) -> list[Array]:
-    """Shorten a path: replace parts of it by straight lines that are proven free of collisions.
+    """Shorten a path in joint space by leaving out corners.
 
-    From each corner the line to the farthest such corner is taken; if there is none, the path
-    continues to the next corner.
+    Beginning at the first corner, the path jumps to the last corner to which a straight line is
+    proven free of collisions, and goes on from there. If there is no such line, it goes to the next
+    corner, on a line that is not proven here.
 
     Args:
         lines: collision checker of straight motions.

@@ -99,7 +99,8 @@ class Forces(ConstraintKind[ForceRow]):
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[ForceRow]:
         """Return rows (scalar inequalities) of normal forces at regular distances along the path,
-        at both of its ends, and at and beside the local maxima of the normal forces.
+        at both of its ends, at the highest local maxima of the normal forces (`PEAK_SHARE`), and at
+        the samples directly before and after these maxima.
 
         A robot whose force is not minimised has rows at fewer samples; its force only decides
         between candidates that are otherwise equal.
@@ -128,8 +129,8 @@ class Forces(ConstraintKind[ForceRow]):
         return self._other_branches(carry)
 
     def peak_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> set[ForceRow]:
-        """Return rows (scalar inequalities) at and beside the local maxima of a candidate's
-        minimised normal forces.
+        """Return rows (scalar inequalities) at the highest local maxima (`PEAK_SHARE`) of a
+        candidate's minimised normal forces, and at the samples directly before and after them.
 
         A program without these rows underestimates the peak forces.
 
@@ -196,15 +197,17 @@ class Forces(ConstraintKind[ForceRow]):
 class Pressure(ConstraintKind[PressureRow]):
     """Rows (scalar inequalities) that keep the centres of pressure within the patches.
 
-    They lie at and beside the samples at which a centre of pressure near the rim is farthest from
-    the middle of its patch.
+    The pressure shift is the distance of a centre of pressure from the middle of its patch. In each
+    stretch of samples with shifts above a threshold, the sample with the largest shift, both
+    neighbouring samples, and those `PRESSURE_STRIDE` before and after it get rows.
     """
 
     persists = True
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PressureRow]:
-        """Return rows (scalar inequalities) at and beside each local maximum of a robot's pressure
-        shift above the share `PRESSURE_SHARE` of the patch radius.
+        """Return rows (scalar inequalities) at and around the largest pressure shift of each
+        stretch of samples in which a robot's shift exceeds the share `PRESSURE_SHARE` of the patch
+        radius. The class states which samples these are.
 
         Args:
             carry: the candidate, evaluated at points of the path.
@@ -213,10 +216,11 @@ class Pressure(ConstraintKind[PressureRow]):
         return self._beyond(carry, PRESSURE_SHARE)
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PressureRow]:
-        """Return rows (scalar inequalities) at and beside each local maximum of a pressure shift
-        that reaches the rim of the patch.
+        """Return rows (scalar inequalities) at and around the largest pressure shift of each
+        stretch of samples in which a centre of pressure is at the rim of its patch or beyond.
 
-        Half of `PATCH_MARGIN` is left for rounding of the solver.
+        This is where the square of shift over patch radius exceeds 1 - `PATCH_MARGIN` / 2. Programs
+        demand the whole margin; half of it is left for rounding of the solver.
 
         Args:
             carry: candidate after the step.
@@ -242,7 +246,7 @@ class JointLimits(ConstraintKind[PathRow]):
 
     def near_rows(self, carry: PlacedCarry, limits: MinimisedForces) -> Iterable[PathRow]:
         """Return rows (scalar inequalities) where a joint is closer to a limit than
-        `JOINT_DISTANCE`.
+        `JOINT_DISTANCE`: one for each stretch of the path, at its closest point.
 
         Args:
             carry: the candidate, evaluated at points of the path.
@@ -252,7 +256,7 @@ class JointLimits(ConstraintKind[PathRow]):
 
     def violated_rows(self, carry: PlacedCarry, known: PlacedCarry) -> Iterable[PathRow]:
         """Return rows (scalar inequalities) where a joint is beyond a limit, or closer to it than
-        half of `SAMPLING_MARGIN`.
+        half of `SAMPLING_MARGIN`: one for each stretch of the path, at its worst point.
 
         Args:
             carry: candidate after the step.
@@ -378,8 +382,9 @@ class ManipulabilityLimits(ConstraintKind[PathRow]):
 class RowSelector:
     """Chooses which rows (single scalar inequalities) a program contains near a candidate.
 
-    A row is kept if it is near its bound, or if a step violated it. In drivable cells no row
-    belongs to a sample, because `hybrid_opt.polishing.drive` limits the forces of the timing.
+    A row is kept if it is near its bound, or if a step violated it. In drivable cells, whose
+    carries are timed from rest to rest within all limits, no row belongs to a sample, because
+    `hybrid_opt.polishing.drive` limits the forces of the timing.
     """
 
     def __init__(self, cell: SmoothCell) -> None:
