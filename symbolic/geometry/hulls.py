@@ -215,10 +215,10 @@ def decompose(triangles: Array, solid: float) -> list[Hull]:
     return [hull_of(part) for part, _, _ in parts]
 
 
-def hull_volume(triangles: Array) -> float:
-    """Compute the volume [m^3] of the convex hull of triangles (n, 3, 3) [m]; 0 for a flat hull."""
+def hull_volume(points: Array) -> float:
+    """Compute the volume [m^3] of the convex hull of points (..., 3) [m]; 0 for a flat hull."""
     try:
-        return float(ConvexHull(triangles.reshape(-1, 3)).volume)
+        return float(ConvexHull(points.reshape(-1, 3)).volume)
     except (QhullError, ValueError):
         return 0.0
 
@@ -234,16 +234,29 @@ def _best_cut(triangles: Array) -> tuple[float, tuple[Array, ...]]:
         The reduction [m^3], and the triangles of both halves; (0, ()) if no plane reduces the
         volume.
     """
-    volume = hull_volume(triangles)
-    lower, upper = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
-    best: tuple[float, tuple[Array, ...]] = (0.0, ())
+    points = np.unique(triangles.reshape(-1, 3), axis=0)  # most corners belong to six triangles
+    volume = hull_volume(points)
+    lower, upper = points.min(axis=0), points.max(axis=0)
+    best, plane = 0.0, (0, 0.0)
     for axis in range(3):
         for level in lower[axis] + CUTS * (upper[axis] - lower[axis]):
-            halves = (_clip(triangles, axis, level, 1.0), _clip(triangles, axis, level, -1.0))
+            halves = (_corners(points, triangles, axis, level, side) for side in (1.0, -1.0))
             gain = volume - sum(hull_volume(half) for half in halves)
-            if gain > best[0]:
-                best = (gain, halves)
-    return best
+            if gain > best:
+                best, plane = gain, (axis, level)
+    return best, tuple(_clip(triangles, *plane, side) for side in (1.0, -1.0) if best > 0.0)
+
+
+def _corners(points: Array, triangles: Array, axis: int, level: float, side: float) -> Array:
+    """Return the points (k, 3) [m] that span the hull of `_clip`, with the arguments of it.
+
+    Args:
+        points: (m, 3) corners of the triangles, each once [m].
+    """
+    inside = side * (triangles[:, :, axis] - level) >= 0.0
+    crossed = triangles[inside.any(axis=1) & ~inside.all(axis=1)]
+    own = points[side * (points[:, axis] - level) >= 0.0]
+    return np.vstack([own, _clip(crossed, axis, level, side).reshape(-1, 3)])
 
 
 def _clip(triangles: Array, axis: int, level: float, side: float) -> Array:

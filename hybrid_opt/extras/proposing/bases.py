@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hybrid_opt.extras.proposing.holding import Hold, HoldQuery, find_holds
 from hybrid_opt.extras.proposing.kinematics import ArmKinematics, shoulder_positions
 from hybrid_opt.extras.proposing.problem import Problem
-from hybrid_opt.extras.proposing.setup import redundancy
+from hybrid_opt.extras.proposing.redundancy import redundancy
 from hybrid_opt.extras.proposing.trial import PayloadSceneChecker
 from symbolic.array import Array
 from symbolic.geometry.bodies import WORLD, MeshReader, collision_bodies, shape_pieces

@@ -14,9 +14,10 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from hybrid_opt.extras.proposing.holding import LIMIT_MARGIN, Hold
+from hybrid_opt.extras.proposing.holding import Hold
 from hybrid_opt.extras.proposing.kinematics import (
     JUMP,
+    LIMIT_MARGIN,
     REACHED,
     TRACKING_STEPS,
     ArmKinematics,

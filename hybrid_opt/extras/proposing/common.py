@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from hybrid_opt.extras.proposing.holding import (
     GUIDES,
-    LIMIT_MARGIN,
     MOST_HOLDS,
     SAME_REDUNDANT,
     SEARCH_DAMPING,
@@ -30,6 +29,7 @@ from hybrid_opt.extras.proposing.holding import (
 from hybrid_opt.extras.proposing.kinematics import (
     DRIFT_SHARE,
     JUMP,
+    LIMIT_MARGIN,
     REACHED,
     STEP_LIMIT,
     TRACKING_STEPS,
@@ -98,6 +98,12 @@ class MachineKinematics:
         q[:, self.arms[arm].common] = x[:, : self.common]
         q[:, self._own[arm]] = x[:, self._entries[arm]]
         return q
+
+    def posture(self, q: Sequence[Array]) -> Array:
+        """Return postures (n, size) from the joint positions (n, joints) of both arms, whose common
+        joints agree [rad or m]."""
+        own = [part[:, joints] for part, joints in zip(q, self._own, strict=True)]
+        return np.hstack([q[0][:, self.arms[0].common], *own])
 
     def drawn(self, count: int, rng: np.random.Generator) -> Array:
         """Draw random postures (count, size) [rad or m].
@@ -240,6 +246,7 @@ class _MachineSearch:
         )
         fine = (residual <= REACHED) & self._regular(np.abs(determinant))
         x, which = x[fine], [part[fine] for part in which]
+        x = self._settled(0, x, which)
         self.found.within += len(x)
         free = ~self._blocked(query.start, x, which)
         x, which = x[free], [part[free] for part in which]
@@ -278,13 +285,49 @@ class _MachineSearch:
             self.found.kept = float(kept.max()) / len(guide)
             self.found.stopped = "both arms together do not reach farther in one motion"
         rows = np.flatnonzero(alive)
-        free = ~self._blocked(self.query.goal, path[-1, rows], [part[rows] for part in which])
+        there = [part[rows] for part in which]
+        path[-1, rows] = self._settled(1, path[-1, rows], there)
+        free = ~self._blocked(self.query.goal, path[-1, rows], there)
         for row in rows[free].tolist():
             ends = np.concatenate([path[0, row], path[-1, row]])
             if np.abs(self._known - ends).max(axis=1).min(initial=np.inf) > SAME_REDUNDANT:
                 self._known = np.vstack([self._known, ends])
                 self.pairs.append(self._holds(path[:, row], measure[:, :, row], which, row))
         return alive
+
+    def _settled(self, end: int, x: Array, which: Sequence[NDArray[np.intp]]) -> Array:
+        """Move the common and the redundant joints of postures x (n, size) to positions with which
+        both arms can follow the motions before or after the carry, because they do not move then.
+
+        All joints follow these motions. Those that do not move in a job stay where this ends, and
+        the arms return to the start (`end` 0) or the goal (1).
+
+        Returns:
+            (n, size) postures; those that cannot be improved are unchanged.
+        """
+        handling, arms = self.query.handling, self.machine.arms
+        if handling is None or not len(x):
+            return x
+        ways = [
+            handling.targets(arm, end, held[part])
+            for arm, held, part in zip(arms, self._held, which, strict=True)
+        ]
+        q = [self.machine.joints(x, k) for k in (0, 1)]
+        shares = [
+            handling.followed(arm, own, way)[0] for arm, own, way in zip(arms, q, ways, strict=True)
+        ]
+        rows = np.flatnonzero(np.minimum(*shares) < 1.0)
+        away = x[rows]
+        for both in zip(*ways, strict=True):
+            away, _, _ = self.machine.solve(away, [way[rows] for way in both], TRACKING_STEPS)
+        better, back = np.ones(len(rows), dtype=bool), []
+        for k, (arm, way) in enumerate(zip(arms, ways, strict=True)):
+            share, path = handling.followed(arm, self.machine.joints(away, k), way[::-1, rows])
+            better &= (share == 1.0) & (limit_room(arm, path[-1:])[0] >= LIMIT_MARGIN)
+            back.append(path[-1])
+        found = x.copy()
+        found[rows[better]] = self.machine.posture(back)[better]
+        return found
 
     def _holds(
         self, path: Array, measure: Array, which: Sequence[NDArray[np.intp]], row: int

@@ -16,16 +16,15 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from hybrid_opt.extras.proposing.holding import (
-    LIMIT_MARGIN,
     SEARCH_DAMPING,
     enters_payload,
     limit_room,
     path_score,
     possible_spins,
 )
-from hybrid_opt.extras.proposing.kinematics import REACHED, ArmKinematics
+from hybrid_opt.extras.proposing.kinematics import LIMIT_MARGIN, REACHED, ArmKinematics
 from hybrid_opt.extras.proposing.problem import Problem
-from hybrid_opt.extras.proposing.setup import redundancy
+from hybrid_opt.extras.proposing.redundancy import redundancy
 from hybrid_opt.extras.proposing.trial import judge_of
 from hybrid_opt.static_hold import require_hold
 from symbolic.array import Array

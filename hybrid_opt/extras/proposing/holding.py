@@ -13,7 +13,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from hybrid_opt.extras.proposing.handling_room import HandlingRoom
 from hybrid_opt.extras.proposing.kinematics import (
+    LIMIT_MARGIN,
     MANIPULABILITY_MARGIN,
     REACHED,
     ArmKinematics,
@@ -123,13 +125,14 @@ def initial_arc(start: Array, goal: Array, bow: Array) -> Array:
     Args:
         start: (6 + m,) first box pose [m, rad] followed by the m redundant joints [rad or m].
         goal: (6 + m,) last box pose and redundant joints.
-        bow: (3,) displacement of the box in the middle of the path, world frame [m].
+        bow: (3,) displacement of the box in the middle of the path, world frame [m]; or (6,) with
+            the change of its angles there [rad].
 
     Returns:
         (GUIDE_POSES, 6 + m) box poses followed by the redundant joints.
     """
     poses = np.linspace(start, goal, GUIDE_POSES)
-    poses[:, :3] += np.sin(np.linspace(0.0, np.pi, GUIDE_POSES))[:, None] * bow
+    poses[:, : len(bow)] += np.sin(np.linspace(0.0, np.pi, GUIDE_POSES))[:, None] * bow
     return poses
 
 
@@ -147,6 +150,13 @@ GUIDES = np.array(
 )
 """Displacements of guides from the straight line at its middle [m]. Collisions do not count along
 guides."""
+
+FURTHER_GUIDES = np.random.default_rng(0).uniform(-1.0, 1.0, (32, 6)) * np.repeat([0.35, 0.3], 3)
+"""Displacements [m] and rotations [rad] of further guides, random ones, for arms with few holds: an
+arm that passes a singular posture on the straight way may pass beside it."""
+
+FEW_HOLDS = 4
+"""An arm with fewer holds looks for more along further guides, and with other redundant joints."""
 
 SAME_POSTURE = 0.05
 """Postures of a six-joint arm count as one if they differ by less in every joint [rad]."""
@@ -166,9 +176,6 @@ straightest."""
 
 MOST_HOLDS = 24
 """Largest number of holds of one arm that are kept, the best first."""
-
-LIMIT_MARGIN = 0.02
-"""Distance of a first path from joint limits [rad]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,6 +236,8 @@ class HoldQuery:
         guides: number of box paths from `GUIDES` that are tried.
         common: (k,) positions of the k joints that also move the other arm, which they keep
             [rad or m]; None if these joints are free like other redundant joints.
+        handling: straight motions before and after the carry, which redundant joints shall allow;
+            None if they do not count.
     """
 
     start: Array
@@ -238,6 +247,7 @@ class HoldQuery:
     starts: int = STARTS
     guides: int = len(GUIDES)
     common: Array | None = None
+    handling: HandlingRoom | None = None
 
 
 def find_holds(query: HoldQuery, kinematics: ArmKinematics, rng: np.random.Generator) -> HoldSearch:
@@ -261,6 +271,7 @@ def find_holds(query: HoldQuery, kinematics: ArmKinematics, rng: np.random.Gener
     q, which = finder.start_postures(T_box_joint)
     if not len(q):
         return found
+    q = finder.settled(0, np.array(T_box_joint)[which], q)
     hit = finder.colliding(query.start, q)
     q, which = q[~hit], which[~hit]
     found.free = len(q)
@@ -351,6 +362,15 @@ class _Finder:
                 self.found.pairs[pair] += 1
         return hit
 
+    def settled(self, end: int, T_box_joint: Array, q: Array) -> Array:
+        """Move the redundant joints of postures at the start (`end` 0) or the goal (1) such that
+        the motions before or after the carry are possible, where they can be; arguments as of
+        `HandlingRoom.settled`."""
+        handling, kinematics = self.query.handling, self.kinematics
+        if handling is None or not kinematics.redundant or not len(q):
+            return q
+        return handling.settled(kinematics, end, T_box_joint, q)
+
     def lead(self, spin: Array, T_box_joint: Array, q: Array) -> None:
         """Find holds: move the arm with the box from each start posture to the goal, and store
         every start posture that arrives there without a collision.
@@ -365,8 +385,10 @@ class _Finder:
         """
         start, goal = self.query.start, self.query.goal
         waiting = np.arange(len(q))
-        for bow in GUIDES[: self.query.guides]:
-            if not len(waiting) or len(self.found.holds) >= ENOUGH_HOLDS:
+        further = FURTHER_GUIDES if self.query.guides == len(GUIDES) else ()
+        for number, bow in enumerate((*GUIDES[: self.query.guides], *further)):
+            enough = ENOUGH_HOLDS if number < len(GUIDES) else FEW_HOLDS
+            if not len(waiting) or len(self.found.holds) >= enough:
                 return
             T_world_box = box_placement(self._orientation, initial_arc(start, goal, bow))
             targets = T_world_box[:, None] @ T_box_joint[waiting]
@@ -377,7 +399,9 @@ class _Finder:
                     targets[:, left], q[waiting[left]]
                 )
                 arrived = np.union1d(arrived, left[also])
-            hit = self.colliding(goal, path[-1, arrived])
+            ends = self.settled(1, T_box_joint[waiting[arrived]], path[-1, arrived])
+            path[-1, arrived] = ends
+            hit = self.colliding(goal, ends)
             for at in arrived[~hit].tolist():
                 row = waiting[at]
                 value = float(score[at] + SPIN_OF_FILE * (spin[row] == 0.0))
@@ -416,16 +440,26 @@ class _Finder:
         fine = (room >= LIMIT_MARGIN) & (measure >= kinematics.least)
         until = np.where(fine.all(axis=0), len(targets), np.argmin(fine, axis=0))
         share = np.minimum(kept, until)
-        farthest = int(np.argmax(share))
-        at = int(share[farthest])
-        if at > self.found.kept * len(targets):
-            self.found.kept = at / len(targets)
-            if at < len(targets):
-                reaches = bool(at < kept[farthest])
-                where = path[at, farthest], float(measure[at, farthest])
-                self.found.stopped = self._stop(*where, reaches)
+        self._note(share, kept, path, measure)
         arrived = np.flatnonzero(share == len(targets))
         return arrived, path, path_score(kinematics, path, room, measure)
+
+    def _note(self, share: Array, kept: NDArray[np.intp], path: Array, measure: Array) -> None:
+        """Remember the farthest of n postures along a guide of m poses, and why it stops there.
+
+        Args:
+            share: (n,) number of poses that a posture follows within its limits.
+            kept: (n,) number of poses that it reaches.
+            path: (m, n, joints) joint paths [rad or m].
+            measure: (m, n) manipulability [m^3].
+        """
+        farthest = int(np.argmax(share))
+        at = int(share[farthest])
+        if at > self.found.kept * len(path):
+            self.found.kept = at / len(path)
+            if at < len(path):
+                where = path[at, farthest], float(measure[at, farthest])
+                self.found.stopped = self._stop(*where, bool(at < kept[farthest]))
 
     def _stop(self, q: Array, measure: float, reaches: bool) -> str:
         """Return as text why the arm cannot follow a path beyond a posture: it does not reach
@@ -469,8 +503,8 @@ class _Finder:
             self._place_common(ends)
         path, kept, measure = kinematics.follow(q, targets, ends, resolved=True)
         room = limit_room(kinematics, path)
-        self.found.kept = max(self.found.kept, float(kept.max(initial=0)) / len(targets))
         fine = (room[-1] >= LIMIT_MARGIN) & (measure[-1] >= kinematics.least)
+        self._note(np.where(fine, kept, np.minimum(kept, len(path) - 1)), kept, path, measure)
         arrived = np.flatnonzero((kept == len(targets)) & fine)
         return arrived, path, path_score(kinematics, path, room, measure)
 

@@ -34,6 +34,9 @@ DRIFT_SHARE = 0.03
 MANIPULABILITY_MARGIN = 1.1
 """Least manipulability of a hold, over the least of the cell."""
 
+LIMIT_MARGIN = 0.02
+"""Distance of a first path from joint limits [rad]."""
+
 JUMP = 0.5
 """Largest change of a joint between poses of a path [rad]."""
 
@@ -90,10 +93,17 @@ class ArmKinematics:
         compiled: the arm in the compiled module.
     """
 
-    def __init__(self, workcell: Workcell, arm: int, geometry: ArmGeometry | None = None) -> None:
+    def __init__(
+        self,
+        workcell: Workcell,
+        arm: int,
+        geometry: ArmGeometry | None = None,
+        redundant: tuple[int, ...] | None = None,
+    ) -> None:
         self.workcell, self.arm = workcell, arm
         self.geometry = geometry = geometry or arm_geometry(workcell, arm)
-        self.redundant = tuple(joint for joint, _ in workcell.task.redundant_entries[arm])
+        own = tuple(joint for joint, _ in workcell.task.redundant_entries[arm])
+        self.redundant = own if redundant is None else redundant
         self.common = [joint.drives[arm] for joint in workcell.task.redundant if joint.is_common]
         self.following = [k for k in range(geometry.joints) if k not in self.redundant]
         self.lower, self.upper = np.asarray(geometry.lower), np.asarray(geometry.upper)
@@ -115,6 +125,10 @@ class ArmKinematics:
         """
         geometry = replace(self.geometry, T_world_root=T_world_root)
         return ArmKinematics(self.workcell, self.arm, geometry)
+
+    def with_redundant(self, joints: tuple[int, ...]) -> ArmKinematics:
+        """Return the same arm with other redundant joints, given by their indices."""
+        return ArmKinematics(self.workcell, self.arm, self.geometry, joints)
 
     def held(self, spin: float = 0.0) -> Array:
         """Compute T_box_joint (4, 4), the pose in the box frame of the arm's last joint while the
@@ -186,7 +200,8 @@ class ArmKinematics:
         redundant ones too, except those in `held`.
 
         Newton steps have least norm. The first one also moves the joints towards the middle of
-        their ranges, as far as the poses leave them free.
+        their ranges, as far as the poses leave them free. Joints stay within their limits as long
+        as six others can move.
 
         Args:
             q: (n, joints) postures at which the search starts, such as those at the previous pose
@@ -194,10 +209,10 @@ class ArmKinematics:
             target: (n, 4, 4) wanted poses of the last joint in the world.
             held: indices of the joints that do not move.
         """
-        middle = (self.lower + self.upper) / 2.0
         moving = np.isin(np.arange(q.shape[1]), held, invert=True).astype(float)
-        steps = TRACKING_STEPS, moving, middle, DRIFT_SHARE
-        return Postures(*self.compiled.track(q, target, *steps))
+        limits = self.lower + LIMIT_MARGIN, self.upper - LIMIT_MARGIN
+        found = self.compiled.track(q, target, TRACKING_STEPS, moving, *limits, DRIFT_SHARE)
+        return Postures(*found)
 
     def follow(
         self, q: Array, targets: Array, ends: Array | None = None, resolved: bool = False

@@ -120,21 +120,31 @@ class Arm {
     });
   }
 
-  // `ArmKinematics.track`, with (joints,) moving 1 or 0 and the first step's drift (joints,) to `middle`.
+  // `ArmKinematics.track`, with (joints,) moving 1 or 0 and the first step's drift (joints,) to the
+  // middle between (joints,) lower and upper limits. Joints that would leave their limits do not move.
   py::tuple track(const Numbers &q, const Numbers &targets, int steps, const Numbers &moving,
-                  const Numbers &middle, double share) const {
+                  const Numbers &lower, const Numbers &upper, double share) const {
     const py::ssize_t m = joints();
-    const Row free(checked(moving, m), m), centre(checked(middle, m), m);
+    const Row low(checked(lower, m), m), high(checked(upper, m), m), all(checked(moving, m), m);
+    const Joints centre = (low + high) / 2.0;
     return moved(q, targets, [&](Joints &at, const Pose &target, State &state) {
       for (int step = 0;; ++step) {
         place(at, state), compare(target, state);
         if (step == steps) return;
-        const Columns own = state.J * free.asDiagonal();
-        Matrix6 squares = own * own.transpose();
-        squares.diagonal().array() += LEAST_NORM;
-        Joints drift = Joints::Zero(m);
-        if (step == 0) drift = share * (centre - at).cwiseProduct(free);
-        at += drift + own.transpose() * squares.ldlt().solve(state.error - own * drift);
+        Joints free = all, move;
+        for (bool again = true; again;) {
+          const Columns own = state.J * free.asDiagonal();
+          Matrix6 squares = own * own.transpose();
+          squares.diagonal().array() += LEAST_NORM;
+          Joints drift = Joints::Zero(m);
+          if (step == 0) drift = share * (centre - at).cwiseProduct(free);
+          move = drift + own.transpose() * squares.ldlt().solve(state.error - own * drift);
+          again = false;
+          for (py::ssize_t i = 0; i < m && free.sum() > 6.0; ++i)
+            if ((move[i] > 0.0 && at[i] + move[i] > high[i]) || (move[i] < 0.0 && at[i] + move[i] < low[i]))
+              free[i] = 0.0, again = true;
+        }
+        at += move;
       }
     });
   }

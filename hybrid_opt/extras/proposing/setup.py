@@ -7,7 +7,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from itertools import combinations, product
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.evaluate.explanation import missing_reach
 from hybrid_opt.extras.proposing.closed_chain import ChainConfiguration, ClosedChain
 from hybrid_opt.extras.proposing.common import MachineKinematics, machine_holds
+from hybrid_opt.extras.proposing.handling_room import HandlingRoom
 from hybrid_opt.extras.proposing.holding import (
     GUIDES,
     SEARCH_DAMPING,
@@ -30,18 +31,22 @@ from hybrid_opt.extras.proposing.holding import (
 from hybrid_opt.extras.proposing.kinematics import REACHED, ArmKinematics, rotate_about_normal
 from hybrid_opt.extras.proposing.planner import Retreats, retreats
 from hybrid_opt.extras.proposing.problem import Problem
+from hybrid_opt.extras.proposing.redundancy import more_holds, redundancy
 from hybrid_opt.extras.proposing.trial import MARGINS, PoseJudge, judge_of
 from hybrid_opt.robust.budget import budget_text
 from hybrid_opt.static_hold import require_hold
 from symbolic.array import Array
 from symbolic.cell_model import CellBodies, build_cell_bodies
-from symbolic.read.arms import FOLLOWING, arm_model, common_joints, turning_joints
+from symbolic.read.arms import arm_model
 from symbolic.read.editing import merged
 from symbolic.records import POSE_SIZE, Task, Workcell
 from symbolic.records.poses import box_placement
 
 RANKING_GUIDES = 3
 """Number of guides by which pairs are ranked: straight, bowing up, and far up."""
+
+HANDLING = 0.5
+"""Promise of a pair with which the motions before and after the carry are possible."""
 
 MOST_PAIRS = 32
 """Number of pairs that are ranked in detail, the best by the scores of both arms."""
@@ -81,6 +86,7 @@ class Pair:
 def ranked_pairs(
     workcell: Workcell,
     judge: PoseJudge,
+    handling: HandlingRoom,
     holds: Iterable[tuple[Hold, Hold]],
     ends: tuple[Array, Array],
 ) -> list[Pair]:
@@ -93,10 +99,18 @@ def ranked_pairs(
     Args:
         workcell: the cell, with chosen redundant joints.
         judge: checker of collisions, without a margin.
+        handling: straight motions before and after the carry.
         holds: pairs of holds; in each pair, joints that move both arms have equal positions.
         ends: start and goal pose (6,) of the box [m, rad].
     """
-    scored = [(a.score + b.score, (a, b)) for a, b in holds]
+    both = list(holds)
+    if not both:
+        return []
+    room = _handling_shares(handling, workcell, both)
+    scored = [
+        (0.1 * (a.score + b.score) + HANDLING * share, (a, b))
+        for (a, b), share in zip(both, room, strict=True)
+    ]
     scored.sort(key=lambda item: -item[0])
     judges = cache(judge.with_margin)
     models = (arm_model(workcell.robots[0]), arm_model(workcell.robots[1]))
@@ -108,9 +122,26 @@ def ranked_pairs(
         )
         if wide is not None:
             chain = ClosedChain(workcell, wide, pair, models)
-            promise = _free_share(chain, start, goal) + 0.1 * score
+            promise = _free_share(chain, start, goal) + score
             found.append(Pair(pair, start, goal, chain, promise))
     return sorted(found, key=lambda pair: -pair.promise)
+
+
+def _handling_shares(
+    room: HandlingRoom, workcell: Workcell, pairs: Sequence[tuple[Hold, Hold]]
+) -> Array:
+    """Compute how far the motions before and after a carry are possible with each of n pairs of
+    holds: (n,) shares of the worse arm."""
+    found = []
+    for arm in (0, 1):
+        own = list({id(pair[arm]): pair[arm] for pair in pairs}.values())
+        kinematics = ArmKinematics(workcell, arm)
+        ends = (np.array([hold.q_start for hold in own]), np.array([hold.q_goal for hold in own]))
+        T_box_joint = np.array([kinematics.held(hold.spin) for hold in own])
+        shares = room.shares(kinematics, T_box_joint, ends)
+        known = {id(hold): float(share) for hold, share in zip(own, shares, strict=True)}
+        found.append([known[id(pair[arm])] for pair in pairs])
+    return np.asarray(np.min(found, axis=0))
 
 
 def _place(task: Task, pose: Array, holds: tuple[Hold, Hold], end: int) -> ChainConfiguration:
@@ -220,7 +251,8 @@ def prepare(
         WorkcellError: the problem is wrong, or the payload cannot be held at rest.
     """
     start, goal = problem.poses
-    given = merged(given, redundancy(problem, problem.workcell(given)))
+    known, chosen = problem.workcell(given), given
+    given = merged(chosen, redundancy(problem, known))
     workcell = problem.workcell(given)
     require_hold(workcell)
     tell(budget_text(workcell))
@@ -232,17 +264,29 @@ def prepare(
     blocked = box_blocked(judge, start, goal)
     if blocked:
         raise NoHoldError(blocked)
-    query = HoldQuery(start, goal, spins, judge)
+    handling = HandlingRoom(workcell, judge, (start, goal))
+    query = HoldQuery(start, goal, spins, judge, handling=handling)
     arms = [ArmKinematics(workcell, arm) for arm in (0, 1)]
     machine = MachineKinematics(arms) if arms[0].common else None
     at_rest = query if machine is None else replace(query, common=machine.rest[: machine.common])
     tried = [[find_holds(at_rest, arm, rng) for arm in arms]]
+    if machine is None:
+        more = [
+            more_holds(problem, query, arm, one, rng)
+            for arm, one in zip(arms, tried[0], strict=True)
+        ]
+        tried, ranks = [[one for one, _ in more]], (more[0][1], more[1][1])
+        if any(ranks):
+            given = merged(chosen, redundancy(problem, known, ranks))
+            workcell = problem.workcell(given)
+            bodies = build_cell_bodies(workcell, bodies)
+            judge = judge_of(bodies)
     held = product(tried[0][0].holds, tried[0][1].holds)
-    pairs = ranked_pairs(workcell, judge, held, (start, goal))
+    pairs = ranked_pairs(workcell, judge, handling, held, (start, goal))
     if machine is not None and len(pairs) < ENOUGH_PAIRS:
         found, moving = machine_holds(query, arms, rng)
         tried.append([found])
-        pairs += ranked_pairs(workcell, judge, moving, (start, goal))
+        pairs += ranked_pairs(workcell, judge, handling, moving, (start, goal))
     if not pairs:
         raise ProposalError(_no_pair(query, judge, max(tried, key=_progress)))
     return Setup(given, workcell, bodies, sorted(pairs, key=lambda pair: -pair.promise))
@@ -260,72 +304,6 @@ def _progress(searches: Sequence[HoldSearch]) -> tuple[float, ...]:
         searches: result for each arm, or for both on common joints.
     """
     return min((len(one.holds), one.kept, one.free, one.within) for one in searches)
-
-
-def redundancy(problem: Problem, workcell: Workcell) -> dict[str, Any]:
-    """Choose the redundant joints of arms with more than six joints, and their initial positions,
-    the middle of their ranges. Redundant joints that the file names are kept.
-
-    Args:
-        problem: the problem.
-        workcell: its cell.
-
-    Returns:
-        Additions to the tables `robots` and `task` of the problem; empty if no arm has more than
-        six joints.
-    """
-    robots: list[dict[str, Any]] = [{}, {}]
-    entries: dict[str, dict[str, Any]] = {}
-    common = common_joints(workcell.robots)
-    for i, robot in enumerate(workcell.robots):
-        model = arm_model(robot)
-        if model.nq == FOLLOWING:
-            continue
-        names = list(model.names)[1:]
-        chosen = list(robot.redundant_joints)
-        if not problem.data["robots"][i].get("redundant_joints"):
-            chosen = [names[k] for k in redundant_joints(workcell, i, common)]
-        robots[i]["redundant_joints"] = chosen
-        for name in chosen:
-            joint = names.index(name)
-            middle = float(robot.position_lower[joint] + robot.position_upper[joint]) / 2.0
-            key = name if name in common else f"{robot.name}/{name}"
-            entries.setdefault(key, {"joint": key, "initial": middle})
-    return {"robots": robots, "task": {"redundant": list(entries.values())}} if entries else {}
-
-
-def redundant_joints(workcell: Workcell, arm: int, common: tuple[str, ...]) -> tuple[int, ...]:
-    """Choose the redundant joints of an arm: all joints but six.
-
-    Joints that move both arms come first, then sliding joints. The remaining ones are chosen such
-    that the other six joints are best conditioned: over random postures, the median of the smallest
-    singular value of their Jacobian is largest.
-
-    Args:
-        workcell: the cell.
-        arm: index of the arm.
-        common: names of the joints that move both arms.
-
-    Returns:
-        Indices of the chosen joints.
-    """
-    robot = workcell.robots[arm]
-    model = arm_model(robot)
-    names, beyond = list(model.names)[1:], model.nq - FOLLOWING
-    held = [names.index(name) for name in common]
-    sliding = [k for k, turns in enumerate(turning_joints(model)) if not turns and k not in held]
-    forced = [*held, *sliding][:beyond]
-    kinematics = ArmKinematics(workcell, arm)
-    q = kinematics.drawn(POSTURES, np.random.default_rng(0))
-    _, jacobian = kinematics.pose_and_jacobian(q)
-
-    def condition(joints: tuple[int, ...]) -> float:
-        rest = [k for k in range(model.nq) if k not in joints]
-        return float(np.median(np.linalg.svd(jacobian[:, :, rest], compute_uv=False)[:, -1]))
-
-    others = [k for k in range(model.nq) if k not in forced]
-    found = combinations(others, beyond - len(forced))
-    return max((tuple(sorted((*forced, *more))) for more in found), key=condition)
 
 
 def box_blocked(judge: PoseJudge, start: Array, goal: Array) -> str:

@@ -265,13 +265,16 @@ class PoseJudge:
             self.met[found.first_touch.first, found.first_touch.second] += 1
         return found.colliding
 
-    def arm_colliding(self, arm: int, pose: Array, q: Array) -> NDArray[np.bool_]:
+    def arm_colliding(
+        self, arm: int, pose: Array, q: Array, with_box: bool = True
+    ) -> NDArray[np.bool_]:
         """Find configurations of one arm and the box that collide. The other arm is left out.
 
         Args:
             arm: index of the arm.
             pose: (n, 6) box poses [m, rad].
             q: (n, joints) joint positions of the arm [rad or m].
+            with_box: False to leave out the box too.
 
         Returns:
             (n,) True for configurations that collide.
@@ -280,6 +283,8 @@ class PoseJudge:
         q_1, q_2 = (q, absent) if arm == 0 else (absent, q)
         bounds = self.checker.bounds(pose, q_1, q_2)
         bounds[:, self._others[arm]] = np.inf
+        if not with_box:
+            bounds[:, [PAYLOAD_NAME in names for names in self.geometry.pair_names]] = np.inf
         return self.checker.check(pose, q_1, q_2, bounds).colliding
 
     def payload_colliding(self, pose: Array) -> NDArray[np.bool_]:

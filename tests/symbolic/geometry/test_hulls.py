@@ -20,6 +20,8 @@ from symbolic.geometry.hulls import (
     ROUNDOFF,
     SMALL_PART,
     STAND_OUT,
+    _clip,
+    _corners,
     cut,
     hull_of,
     simplify,
@@ -165,3 +167,14 @@ def test_threads_decompose_a_mesh_once_and_again_when_its_file_changes(tmp_path:
         for each in several:
             reach = np.linalg.norm(each, axis=1)
             assert radius - 1e-6 <= reach.max() <= radius + 1e-3
+
+
+def test_the_corners_of_a_half_span_the_hull_of_its_triangles() -> None:
+    mesh = trimesh.creation.torus(0.2, 0.05, 24, 12)
+    triangles = np.asarray(mesh.triangles)
+    for axis, level, side in ((0, 0.03, 1.0), (1, -0.1, -1.0), (2, 0.0, 1.0)):
+        points = _corners(np.asarray(mesh.vertices), triangles, axis, level, side)
+        half = _clip(triangles, axis, level, side).reshape(-1, 3)
+        volumes = [ConvexHull(part).volume for part in (points, half)]
+        assert np.isclose(volumes[0], volumes[1], rtol=1e-9)
+        assert len(points) < len(half)

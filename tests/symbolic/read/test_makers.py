@@ -11,7 +11,7 @@ import pytest
 
 from hybrid_opt.errors import SimulationError
 from hybrid_opt.extras.proposing.problem import read_problem
-from hybrid_opt.extras.proposing.setup import redundancy
+from hybrid_opt.extras.proposing.redundancy import redundancy
 from hybrid_opt.extras.simulation.arms import CellSimulation
 from symbolic.errors import OutsideError, WorkcellError
 from symbolic.read.arms import RobotModelWarning, _warn_left_out

@@ -19,7 +19,8 @@ from hybrid_opt.extras.proposing.planner import Corridor, plan, search_subspace,
 from hybrid_opt.extras.proposing.problem import read_problem
 from hybrid_opt.extras.proposing.proposal import ProposeSettings
 from hybrid_opt.extras.proposing.proposal import _Search as Search
-from hybrid_opt.extras.proposing.setup import Setup, prepare, redundancy
+from hybrid_opt.extras.proposing.redundancy import redundancy
+from hybrid_opt.extras.proposing.setup import Setup, prepare
 from hybrid_opt.extras.proposing.trial import PayloadSceneChecker, Trial, grasp_blocked, judge_of
 from hybrid_opt.extras.proposing.via_points import (
     fit,
