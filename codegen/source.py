@@ -190,8 +190,8 @@ def _filled(driver: str, signature: Signature, generated: str = "") -> str:
     Args:
         driver: C text with placeholders.
         signature: name and sizes of the function.
-        generated: CasADi's C code of the function. If it keeps state between calls, the driver is
-            told so; '' for code without state.
+        generated: CasADi's C code of the function, which shows whether the function keeps state
+            between calls; '' for code without state.
     """
     inputs = [prod(shape) for shape in signature.input_shapes]
     outputs = [prod(shape) for shape in signature.output_shapes]

@@ -13,7 +13,7 @@ bodies that it stands on until it is lifted, and penetrate them by at most `REST
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Protocol
@@ -183,12 +183,7 @@ class JobCollisions:
 
         found = 0.0 if height is None else height
         if height is None and len(below):
-            for _ in range(MOST_STEPS):
-                gap = float(gaps(found).min())
-                found += gap
-                if gap <= FCL_RESOLUTION or found > LARGEST_DROP:
-                    break
-            found = 0.0 if found > LARGEST_DROP else found
+            found = standing_height(lambda drop: float(gaps(drop).min()))
         touched = gaps(found) <= RESTING_TOLERANCE
         names = [bodies[body].name for body in below[touched].tolist()]
         return SupportedPose(_lowered(pose, found), found, tuple(names))
@@ -228,6 +223,23 @@ class JobCollisions:
         )
         cell = replace(self._workcell, task=task)
         return CollisionChecker(replace(self.geometry, workcell=cell), self._functions)
+
+
+def standing_height(gap: Callable[[float], float]) -> float:
+    """Compute by how much a box is lowered until it stands [m]; 0 if nothing is within
+    `LARGEST_DROP` below it.
+
+    Args:
+        gap: function that returns the distance [m] between the box, lowered by its argument [m],
+            and the nearest body that may support it; 0 if they touch.
+    """
+    found = 0.0
+    for _ in range(MOST_STEPS):
+        distance = gap(found)
+        found += distance
+        if distance <= FCL_RESOLUTION or found > LARGEST_DROP:
+            break
+    return 0.0 if found > LARGEST_DROP else found
 
 
 def job_geometry(workcell: Workcell, everywhere: bool = False) -> CellGeometry:

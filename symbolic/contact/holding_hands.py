@@ -26,7 +26,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import reduce
+from functools import cached_property, reduce
 from typing import Any
 
 import casadi as ca
@@ -306,7 +306,7 @@ class HoldingHands(ContactModel):
     closing = ("grip_on", "load")
     opening = ("unload", "grip_off")
 
-    @property
+    @cached_property
     def pad_parameters(self) -> list[dict[str, Any]]:
         """One dictionary per hand with the fields that `NumberedContact` adds for hands: 'share'
         (6, 6), the hand's matrix of `layer_shares`; 'opposed' (4,), the hand's row of

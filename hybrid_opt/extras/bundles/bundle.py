@@ -114,7 +114,7 @@ class Origin:
 
 
 STATES = {
-    "ready": "both arms are checked: both report, pads are at their first places, nothing presses",
+    "ready": "both arms are checked: they report, pads are where they begin, nothing presses",
     "running": "both arms follow the path; phases follow each other without a gap",
     "stopping": "both arms come to rest at the same place of the path, within the stop time",
     "landing": "the box stands before the end of its set-down: both arms let go of it there",

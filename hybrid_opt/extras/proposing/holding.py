@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from hybrid_opt.extras.proposing.handling_room import HandlingRoom
+from hybrid_opt.extras.proposing.handling import HandlingMotions
 from hybrid_opt.extras.proposing.kinematics import (
     LIMIT_MARGIN,
     MANIPULABILITY_MARGIN,
@@ -233,7 +233,7 @@ class HoldQuery:
             the file [rad].
         judge: checker of collisions; None if collisions do not count.
         starts: number of random starts of the search for postures.
-        guides: number of box paths from `GUIDES` that are tried.
+        guides: number of box paths that are tried, those of `GUIDES` before `FURTHER_GUIDES`.
         common: (k,) positions of the k joints that also move the other arm, which they keep
             [rad or m]; None if these joints are free like other redundant joints.
         handling: straight motions before and after the carry, which redundant joints shall allow;
@@ -245,9 +245,9 @@ class HoldQuery:
     spins: Array
     judge: PoseJudge | None
     starts: int = STARTS
-    guides: int = len(GUIDES)
+    guides: int = len(GUIDES) + len(FURTHER_GUIDES)
     common: Array | None = None
-    handling: HandlingRoom | None = None
+    handling: HandlingMotions | None = None
 
 
 def find_holds(query: HoldQuery, kinematics: ArmKinematics, rng: np.random.Generator) -> HoldSearch:
@@ -365,7 +365,7 @@ class _Finder:
     def settled(self, end: int, T_box_joint: Array, q: Array) -> Array:
         """Move the redundant joints of postures at the start (`end` 0) or the goal (1) such that
         the motions before or after the carry are possible, where they can be; arguments as of
-        `HandlingRoom.settled`."""
+        `HandlingMotions.settled`."""
         handling, kinematics = self.query.handling, self.kinematics
         if handling is None or not kinematics.redundant or not len(q):
             return q
@@ -376,7 +376,8 @@ class _Finder:
         every start posture that arrives there without a collision.
 
         The paths of the box in `GUIDES` are tried one after the other, each with the postures that
-        have not arrived yet, until `ENOUGH_HOLDS` holds are found.
+        have not arrived yet, until `ENOUGH_HOLDS` holds are found; then those in `FURTHER_GUIDES`,
+        until there are `FEW_HOLDS`.
 
         Args:
             spin: (n,) rotation of the pad about its normal, for each posture [rad].
@@ -385,8 +386,7 @@ class _Finder:
         """
         start, goal = self.query.start, self.query.goal
         waiting = np.arange(len(q))
-        further = FURTHER_GUIDES if self.query.guides == len(GUIDES) else ()
-        for number, bow in enumerate((*GUIDES[: self.query.guides], *further)):
+        for number, bow in enumerate((*GUIDES, *FURTHER_GUIDES)[: self.query.guides]):
             enough = ENOUGH_HOLDS if number < len(GUIDES) else FEW_HOLDS
             if not len(waiting) or len(self.found.holds) >= enough:
                 return

@@ -16,7 +16,7 @@ from hybrid_opt.errors import NoHoldError, ProposalError
 from hybrid_opt.evaluate.explanation import missing_reach
 from hybrid_opt.extras.proposing.closed_chain import ChainConfiguration, ClosedChain
 from hybrid_opt.extras.proposing.common import MachineKinematics, machine_holds
-from hybrid_opt.extras.proposing.handling_room import HandlingRoom
+from hybrid_opt.extras.proposing.handling import HandlingMotions
 from hybrid_opt.extras.proposing.holding import (
     GUIDES,
     SEARCH_DAMPING,
@@ -86,7 +86,7 @@ class Pair:
 def ranked_pairs(
     workcell: Workcell,
     judge: PoseJudge,
-    handling: HandlingRoom,
+    handling: HandlingMotions,
     holds: Iterable[tuple[Hold, Hold]],
     ends: tuple[Array, Array],
 ) -> list[Pair]:
@@ -106,10 +106,10 @@ def ranked_pairs(
     both = list(holds)
     if not both:
         return []
-    room = _handling_shares(handling, workcell, both)
+    shares = _handling_shares(handling, workcell, both)
     scored = [
         (0.1 * (a.score + b.score) + HANDLING * share, (a, b))
-        for (a, b), share in zip(both, room, strict=True)
+        for (a, b), share in zip(both, shares, strict=True)
     ]
     scored.sort(key=lambda item: -item[0])
     judges = cache(judge.with_margin)
@@ -128,7 +128,7 @@ def ranked_pairs(
 
 
 def _handling_shares(
-    room: HandlingRoom, workcell: Workcell, pairs: Sequence[tuple[Hold, Hold]]
+    handling: HandlingMotions, workcell: Workcell, pairs: Sequence[tuple[Hold, Hold]]
 ) -> Array:
     """Compute how far the motions before and after a carry are possible with each of n pairs of
     holds: (n,) shares of the worse arm."""
@@ -138,7 +138,7 @@ def _handling_shares(
         kinematics = ArmKinematics(workcell, arm)
         ends = (np.array([hold.q_start for hold in own]), np.array([hold.q_goal for hold in own]))
         T_box_joint = np.array([kinematics.held(hold.spin) for hold in own])
-        shares = room.shares(kinematics, T_box_joint, ends)
+        shares = handling.shares(kinematics, T_box_joint, ends)
         known = {id(hold): float(share) for hold, share in zip(own, shares, strict=True)}
         found.append([known[id(pair[arm])] for pair in pairs])
     return np.asarray(np.min(found, axis=0))
@@ -264,7 +264,7 @@ def prepare(
     blocked = box_blocked(judge, start, goal)
     if blocked:
         raise NoHoldError(blocked)
-    handling = HandlingRoom(workcell, judge, (start, goal))
+    handling = HandlingMotions(workcell, judge, (start, goal))
     query = HoldQuery(start, goal, spins, judge, handling=handling)
     arms = [ArmKinematics(workcell, arm) for arm in (0, 1)]
     machine = MachineKinematics(arms) if arms[0].common else None

@@ -130,8 +130,7 @@ def fit(
     found.
 
     The search tries points on the path at even distances, the points whose spline is nearest to the
-    path, interpolations between these two, and random shifts of the best so
-    far.
+    path, interpolations between these two, and random shifts of the best so far.
 
     Args:
         chain: both arms, whose pads stay fixed on the box.

@@ -14,7 +14,7 @@ from hybrid_opt.evaluate.objectives import front_of, non_dominated
 from hybrid_opt.indicators import metrics
 from hybrid_opt.polishing import force_front
 from hybrid_opt.polishing.force import ForceSolver, Scalarisation, SolveMode, pascoletti_serafini
-from hybrid_opt.polishing.force_front import (
+from hybrid_opt.polishing.force_attempts import (
     FAR_GAP,
     Chord,
     Edge,

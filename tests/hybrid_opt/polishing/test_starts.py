@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hybrid_opt.evaluate.evaluation import COLLISION, REASONS
-from hybrid_opt.polishing.force_front import better_half
+from hybrid_opt.polishing.force_attempts import better_half
 from hybrid_opt.polishing.starts import (
     LEAST_CHANGE,
     LEAST_ROTATION,

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import signal
+from abc import ABC, abstractmethod
 from argparse import ArgumentParser, Namespace
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -42,7 +43,7 @@ def options_of(description: str | None, arguments: Sequence[str] | None) -> Name
     return parser.parse_args(arguments)
 
 
-class Carry:
+class JobRun(ABC):
     """A job that both arms run. Subclasses reach the arms' controllers.
 
     Attributes:
@@ -67,20 +68,21 @@ class Carry:
         self.signs = None if isinstance(known, Looks) else [each.sign for each in known]
         self.fault, self.lost, self.command, self.log = "", False, "", log
 
+    @abstractmethod
     def take(self, job: Job) -> None:
         """Store the job that is to run next, and begin at its start."""
-        raise NotImplementedError
 
+    @abstractmethod
     def seen(self) -> Seen:
         """Return the measured state of the arms now."""
-        raise NotImplementedError
 
+    @abstractmethod
     def cycle(self) -> None:
         """Handle messages for a short time; advance or stop a job that has begun."""
-        raise NotImplementedError
 
+    @abstractmethod
     def prepare(self) -> None:
-        """Make the controllers ready, once before the arms move. The default does nothing."""
+        """Make the controllers ready, once before the arms move."""
 
     def check(self) -> None:
         """Raise a `Refused` if an arm is not ready for the job."""
@@ -90,8 +92,9 @@ class Carry:
         """Start the job, or raise a `Refused` if the arms are not ready."""
         self.machine.start(self.seen())
 
+    @abstractmethod
     def go_on(self, direction: float) -> None:
-        """Send the commands of a job that continues. The default does nothing.
+        """Send the commands of a job that continues.
 
         Args:
             direction: 1 forward, -1 back.
@@ -172,7 +175,7 @@ class Carry:
 
 
 def run(
-    options: Namespace, folder: Path, config: dict[str, Any], make: Callable[..., Carry], log: Any
+    options: Namespace, folder: Path, config: dict[str, Any], make: Callable[..., JobRun], log: Any
 ) -> int:
     """Run the job of a bundle, or measure its arms.
 
@@ -186,7 +189,7 @@ def run(
 
     Returns:
         Exit code of the program: 0 when the job is done, 2 if it was refused, else as in
-        `Carry.look_after`.
+        `JobRun.look_after`.
     """
     looks, plan = Looks(), config["plan"]
     try:
@@ -197,7 +200,7 @@ def run(
             signal.signal(number, arms.interrupt)
         if options.check:
             arms.check()
-            log.info("both arms are at their first places")
+            log.info("both arms are at their first positions")
             return 0
         arms.prepare()
         if options.bring_up:

@@ -35,7 +35,7 @@ from typing import Any
 from hybrid_opt.extras.bundles.programs.bring_up import Looks, Measured
 from hybrid_opt.extras.bundles.programs.carry_job import Job, Refused
 from hybrid_opt.extras.bundles.programs.carry_machine import Machine, Seen
-from hybrid_opt.extras.bundles.programs.carry_program import Carry, options_of, run
+from hybrid_opt.extras.bundles.programs.carry_program import JobRun, options_of, run
 
 BUNDLE = Path(__file__).resolve().parent
 
@@ -115,7 +115,7 @@ class Press:
         self.way += min(max(target - self.way, -step), step)
 
 
-class Stream(Carry):
+class Stream(JobRun):
     """The control of both arms by EGM: it answers each message of a controller with a commanded
     position."""
 
@@ -217,6 +217,12 @@ class Stream(Carry):
             if time.monotonic() - begin > PATIENCE:
                 raise Refused(f"{self.missing}: is CarryEgm running in both tasks?")
         super().check()
+
+    def prepare(self) -> None:
+        """Do nothing: the programs in the robots prepare their controllers."""
+
+    def go_on(self, direction: float) -> None:
+        """Do nothing: every cycle sends the next command, in either direction of the job."""
 
     def read(self, arm: int, data: bytes, host: str) -> FromRobot | None:
         """Decode a packet that arrived at an arm's socket.

@@ -37,7 +37,7 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 from hybrid_opt.extras.bundles.programs.bring_up import Looks, Measured
 from hybrid_opt.extras.bundles.programs.carry_job import Job, Refused
 from hybrid_opt.extras.bundles.programs.carry_machine import Machine, Moment, Seen
-from hybrid_opt.extras.bundles.programs.carry_program import Carry, options_of, run
+from hybrid_opt.extras.bundles.programs.carry_program import JobRun, options_of, run
 
 BUNDLE = Path(__file__).resolve().parent
 
@@ -89,7 +89,7 @@ def fill(message: Any, values: dict[str, Any]) -> None:
             setattr(message, name, value)
 
 
-class Run(Carry):
+class Run(JobRun):
     """A run of the job by the controllers of both arms, with ROS names and settings from
     config/cell.json."""
 
@@ -433,7 +433,7 @@ class Run(Carry):
 
     def look_after(self) -> int:
         """Supervise the started job until it ends; stop both arms if this program fails. Return the
-        exit code, as in `Carry.look_after`."""
+        exit code, as in `JobRun.look_after`."""
         try:
             return super().look_after()
         except BaseException:

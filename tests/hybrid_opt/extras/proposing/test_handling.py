@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import tomllib
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 import pytest
 
-from hybrid_opt.extras.proposing import holding
-from hybrid_opt.extras.proposing.handling_room import HandlingRoom
-from hybrid_opt.extras.proposing.holding import HoldQuery, find_holds
+from hybrid_opt.extras.proposing.handling import HandlingMotions
+from hybrid_opt.extras.proposing.holding import GUIDES, HoldQuery, find_holds
 from hybrid_opt.extras.proposing.kinematics import ArmKinematics
 from hybrid_opt.extras.proposing.problem import Problem, read_problem
 from hybrid_opt.extras.proposing.redundancy import redundancy, redundant_choices
@@ -31,9 +29,9 @@ from tests.symbolic.read.samples import RACK
 SPINS: Array = 2.0 * np.pi * np.arange(12.0) / 12.0
 
 
-def room_of(cell: Workcell) -> HandlingRoom:
+def motions_of(cell: Workcell) -> HandlingMotions:
     ends = cell.task.waypoints[0].lower, cell.task.waypoints[-1].lower
-    return HandlingRoom(cell, judge_of(build_cell_bodies(cell)), ends)
+    return HandlingMotions(cell, judge_of(build_cell_bodies(cell)), ends)
 
 
 def rack_cell(**handling: Any) -> Workcell:
@@ -50,13 +48,13 @@ def test_the_box_goes_down_to_what_lies_beneath_and_the_pads_back() -> None:
     top = pose_matrix(start[:3] - [0.0, 0.0, height / 2.0 + 0.05 + 0.01], np.zeros(3))
     support = Body("support", Box(np.array([0.1, 0.1, 0.02])), top)
     cell = replace(cell, environment=(support,))
-    room, kinematics = room_of(cell), ArmKinematics(cell, 0)
+    motions, kinematics = motions_of(cell), ArmKinematics(cell, 0)
     held = kinematics.held()
     for end, (pose, drop) in enumerate(
         zip((start, cell.task.waypoints[-1].lower), (0.05, 0.03), strict=True)
     ):
         T = box_placement(cell.task.orientation, pose)
-        found = room.targets(kinematics, end, held[None])[:, 0]
+        found = motions.targets(kinematics, end, held[None])[:, 0]
         np.testing.assert_allclose(found[0], T @ held, atol=1e-12)
         back = T[:3, :3] @ cell.contacts[0].T_box_pad[:3, 2]
         moved = found[-1][:3, 3] - (T @ held)[:3, 3]
@@ -70,17 +68,18 @@ def test_holds_from_which_the_box_cannot_be_set_down_have_no_whole_share(
 ) -> None:
     """Half a metre below its start the box of the rack is out of reach of the arm's posture."""
     cell = rack_cell(lift_height=height, set_down_height=height)
-    room, kinematics = room_of(cell), ArmKinematics(cell, 0)
+    motions, kinematics = motions_of(cell), ArmKinematics(cell, 0)
     ends = cell.task.waypoints[0].lower, cell.task.waypoints[-1].lower
     holds = find_holds(HoldQuery(*ends, SPINS, None), kinematics, np.random.default_rng(1)).holds
     T_box_joint = np.array([kinematics.held(hold.spin) for hold in holds])
     q = np.array([hold.q_start for hold in holds]), np.array([hold.q_goal for hold in holds])
-    shares = room.shares(kinematics, T_box_joint, q)
+    shares = motions.shares(kinematics, T_box_joint, q)
     assert (shares == 1.0).any() == possible
     assert ((shares > 0.0) & (shares <= 1.0)).all()
 
 
-PITCH = Path("studies/problems/pitch-panda.toml")
+PROBLEMS = RACK.parents[1] / "problems"
+PITCH = PROBLEMS / "pitch-panda.toml"
 
 
 def pandas(**changes: Any) -> Problem:
@@ -92,24 +91,23 @@ def pandas(**changes: Any) -> Problem:
 def test_settled_postures_hold_the_box_where_they_did() -> None:
     problem = pandas(handling={"lift_height": 0.1, "set_down_height": 0.1})
     cell = problem.workcell(redundancy(problem, problem.workcell({})))
-    room, kinematics = room_of(cell), ArmKinematics(cell, 0)
+    motions, kinematics = motions_of(cell), ArmKinematics(cell, 0)
     query = HoldQuery(*problem.poses, SPINS, None)
     holds = find_holds(query, kinematics, np.random.default_rng(1)).holds
     held = np.array([kinematics.held(hold.spin) for hold in holds])
     q = np.array([hold.q_start for hold in holds])
-    settled = room.settled(kinematics, 0, held, q)
+    settled = motions.settled(kinematics, 0, held, q)
     model = arm_model(cell.robots[0])
     data = model.createData()
     T_world_box = box_placement(cell.task.orientation, problem.poses[0])
-    for before, after, T_box_joint in zip(q, settled, held, strict=True):
+    for after, T_box_joint in zip(settled, held, strict=True):
         pin.forwardKinematics(model, data, after)
         there = cell.robots[0].T_world_base @ data.oMi[model.njoints - 1].homogeneous
         np.testing.assert_allclose(there, T_world_box @ T_box_joint, atol=1e-4)
         assert (after >= cell.robots[0].position_lower).all()
         assert (after <= cell.robots[0].position_upper).all()
-        assert before.shape == after.shape
-    targets = room.targets(kinematics, 0, held)
-    shares = [room.followed(kinematics, one, targets)[0] for one in (q, settled)]
+    targets = motions.targets(kinematics, 0, held)
+    shares = [motions.followed(kinematics, one, targets)[0] for one in (q, settled)]
     assert (shares[1] >= shares[0]).all()
     assert (shares[1] == 1.0).sum() > (shares[0] == 1.0).sum()
 
@@ -144,9 +142,10 @@ def test_another_redundant_joint_is_chosen_where_an_arm_finds_few_holds() -> Non
                 assert place.extended[6 + arm] == q[own[arm][0]]
 
 
-def test_an_arm_passes_beside_a_singular_posture(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_arm_passes_beside_a_singular_posture() -> None:
     """A quarter turn between two UR5: on straight guides one arm passes a singular posture."""
-    data = tomllib.loads(Path("studies/problems/turn-ur10.toml").read_text(encoding="utf-8"))
+    path = PROBLEMS / "turn-ur10.toml"
+    data = tomllib.loads(path.read_text(encoding="utf-8"))
     ends = {"start": [-0.17, 0.03, 0.37, 0, 0, 0.76], "goal": [0.14, 0.03, 0.44, 0, 0, -0.71]}
     robots = [
         {"robot": "ur5", "base": {"xyz": [0.0, 0.6 * s, 0.0]}, "pad": {"xyz": [0.0, 0.0, 0.09]}}
@@ -154,12 +153,11 @@ def test_an_arm_passes_beside_a_singular_posture(monkeypatch: pytest.MonkeyPatch
     ]
     changes = {"robots": robots, "payload": {"size": [0.24, 0.22, 0.27]}, "task": ends}
     whole = merged(data, changes)
-    path = Path("studies/problems/turn-ur10.toml")
     problem = replace(read_problem(path), data=whole, text=completed("", whole, {}))
     cell = problem.workcell()
     query = HoldQuery(*problem.poses, SPINS, None)
     found = [find_holds(query, ArmKinematics(cell, k), np.random.default_rng(1)) for k in (0, 1)]
     assert all(one.holds for one in found)
-    monkeypatch.setattr(holding, "FURTHER_GUIDES", ())
-    alone = [find_holds(query, ArmKinematics(cell, k), np.random.default_rng(1)) for k in (0, 1)]
+    straight = replace(query, guides=len(GUIDES))
+    alone = [find_holds(straight, ArmKinematics(cell, k), np.random.default_rng(1)) for k in (0, 1)]
     assert not all(one.holds for one in alone)

@@ -11,7 +11,7 @@ import numpy as np
 
 from hybrid_opt.extras.proposing.kinematics import LIMIT_MARGIN, ArmKinematics
 from hybrid_opt.extras.proposing.trial import PoseJudge
-from hybrid_opt.job.plan import LARGEST_DROP
+from hybrid_opt.job.plan import standing_height
 from symbolic.array import Array
 from symbolic.contact.registry import contact_model
 from symbolic.geometry.bodies import WORLD
@@ -20,16 +20,10 @@ from symbolic.records import PAYLOAD_NAME, Workcell
 from symbolic.records.poses import box_placement
 
 HANDLING_STEP = 0.0125
-"""Distance between the checked places of a straight motion [m]."""
-
-STANDING_GAP = 1e-3
-"""A box with less air below it stands [m]."""
-
-MOST_LOWERINGS = 40
-"""Largest number of steps by which a box is lowered until it stands."""
+"""Distance between neighbouring checked poses of a straight motion [m]."""
 
 
-class HandlingRoom:
+class HandlingMotions:
     """The straight motions of one cell around its carries."""
 
     def __init__(self, workcell: Workcell, judge: PoseJudge, ends: tuple[Array, Array]) -> None:
@@ -54,17 +48,14 @@ class HandlingRoom:
         geometry = self._judge.geometry
         box = geometry.bodies[geometry.index(PAYLOAD_NAME)].pieces
         standing = [body.pieces for body in geometry.bodies if body.frame == WORLD]
-        found, lowered = 0.0, T_world_box.copy()
-        for _ in range(MOST_LOWERINGS if standing else 0):
+
+        def gap(drop: float) -> float:
+            lowered = T_world_box.copy()
+            lowered[2, 3] -= drop
             pieces = tuple(piece.moved(lowered) for piece in box)
-            gap = min(coal_distance(pieces, other) for other in standing)
-            if gap <= STANDING_GAP:
-                return found
-            found += gap
-            lowered[2, 3] -= gap
-            if found > LARGEST_DROP:
-                break
-        return 0.0
+            return max(min(coal_distance(pieces, other) for other in standing), 0.0)
+
+        return standing_height(gap) if standing else 0.0
 
     def targets(self, kinematics: ArmKinematics, end: int, T_box_joint: Array) -> Array:
         """Compute the poses (m, n, 4, 4) of an arm's last joint on its way from the carry's end,
@@ -86,8 +77,8 @@ class HandlingRoom:
         return found
 
     def settled(self, kinematics: ArmKinematics, end: int, T_box_joint: Array, q: Array) -> Array:
-        """Move the redundant joints of n postures at an end of the carry to positions with which
-        the arm can follow the motions, because they do not move then.
+        """Choose the redundant joints of n postures at an end of the carry such that the arm can
+        follow the motions with the other joints alone, as a job does.
 
         Args:
             kinematics: the arm.
@@ -112,8 +103,8 @@ class HandlingRoom:
         self, kinematics: ArmKinematics, T_box_joint: Array, ends: tuple[Array, Array]
     ) -> Array:
         """Compute how far an arm can follow the motions: the share of the poses that it reaches
-        within its joint limits, at the worse of both ends. Motions whose last place collides count
-        half.
+        within its joint limits, at the worse of both ends. Motions to a pose at which the arm
+        collides count half.
 
         Args:
             kinematics: the arm.
@@ -135,7 +126,7 @@ class HandlingRoom:
 
     @staticmethod
     def followed(kinematics: ArmKinematics, q: Array, targets: Array) -> tuple[Array, Array]:
-        """Follow poses with an arm whose redundant joints do not move.
+        """Follow poses with an arm. Its redundant joints stand still.
 
         Args:
             kinematics: the arm.
